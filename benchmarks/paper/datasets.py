@@ -16,10 +16,9 @@ import numpy as np
 
 from benchmarks.paper.twin import HOLD_S, RobotConfig, simulate
 from jaxcal.arguments import Parser, exit_code, several, values_of
-from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.dataset_files import save_csv, save_npz
+from jaxcal.evaluation.dataset import Dataset, save_csv, save_npz
 from jaxcal.files import require_writable_folder, write_text
-from jaxcal.paper.constants import (
+from jaxcal.paper.datasets import (
     AXES,
     BIAS_DEG,
     EPISODES,
@@ -29,10 +28,10 @@ from jaxcal.paper.constants import (
     RANGES,
     RECORDED,
     SCALE,
+    SHIPPED,
+    streams,
 )
 from jaxcal.paper.datasets import make_dataset as drawn_or_recorded
-from jaxcal.paper.datasets import streams
-from jaxcal.paper.recordings import SHIPPED
 from jaxcal.progress import Progress
 
 __all__ = ["dataset0_robot", "main", "make_dataset", "write_datasets"]

@@ -336,9 +336,8 @@ def _whole(
 
 def _dataset(name: str, options: EvaluateOptions) -> Dataset:
     from jaxcal.commands.tables import draw_sets, holds_sets
-    from jaxcal.evaluation.dataset import Dataset
-    from jaxcal.evaluation.dataset_files import load_dataset
-    from jaxcal.paper.constants import EPISODES
+    from jaxcal.evaluation.dataset import Dataset, load_dataset
+    from jaxcal.paper.datasets import EPISODES
 
     if name in EPISODES:
         from jaxcal.paper.datasets import make_dataset

@@ -258,7 +258,7 @@ def candidates_of(path: str) -> GivenCandidates:
 
     The best postures do not depend on the unit; float32 and the paper's network do.
     """
-    from jaxcal.evaluation.dataset_files import load_dataset
+    from jaxcal.evaluation.dataset import load_dataset
 
     if holds_sets(path):
         dataset = load_dataset(path)

@@ -1,7 +1,6 @@
 """How close each way of choosing postures comes to the proven optimum."""
 
-from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.dataset_files import load_dataset, save_csv, save_npz
+from jaxcal.evaluation.dataset import Dataset, load_dataset, save_csv, save_npz
 from jaxcal.evaluation.methods import evaluate
 from jaxcal.evaluation.postures import PostureEvaluation
 from jaxcal.evaluation.report import text_table

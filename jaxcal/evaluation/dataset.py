@@ -1,17 +1,37 @@
-"""Candidate sets to evaluate on, and what was measured at them."""
+"""Candidate sets to evaluate on, and their files; malformed ones are refused.
+
+.npz: ``candidates`` (episodes, M, n); optional ``measured`` (episodes, M, m),
+``available`` (episodes, M) and ``low``, ``high`` (n,), the ranges that [0, 1] stands
+for. .csv: one candidate a line under the header ``episode,candidate,u_x,u_y,u_z`` and
+optionally ``,y_x,y_y,y_z`` and ``,available``; any columns ``u_...`` are inputs and any
+``y_...`` outputs, in their order; lines may come in any order.
+"""
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import hashlib
+import io
+import os
+import pathlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
-from jaxcal.checks import Array, array_of, require_none
+from jaxcal.checks import Array, array_of, axis_letter, require_none
+from jaxcal.files import atomic_write
+from jaxcal.tables import COMMANDS, MEASURED, Table, parse
 
 Mask = NDArray[np.bool_]
+
+_KEYS = ("candidates", "measured", "available")
+_ENDS = ("low", "high")
+_LABELS = ("episode", "candidate")
+_MASK = "available"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,60 +47,214 @@ class Dataset:
     sha256: str | None = None  # of the file it was read from
 
     def __post_init__(self) -> None:
-        u = array_of("candidates", self.candidates, "episodes", "M", "n")
-        if 0 in u.shape:
-            raise ValueError(f"candidates must have no axis of length 0, got {u.shape}")
-        object.__setattr__(self, "candidates", u)
+        axes = {"candidates": ("episodes", "M", "n")}
         if self.measured is not None:
-            y = array_of("measured", self.measured, *u.shape[:2], "m")
-            if 0 in y.shape:
-                raise ValueError(f"measured must have no axis of length 0: {y.shape}")
-            object.__setattr__(self, "measured", y)
+            axes["measured"] = ("episodes", "M", "m")
+        sizes: dict[str, Any] = {}
+        for name, letters in axes.items():
+            shape = [sizes.get(letter, letter) for letter in letters]
+            array = array_of(name, getattr(self, name), *shape)
+            if 0 in array.shape:
+                raise ValueError(
+                    f"{name} must have no axis of length 0, got {array.shape}"
+                )
+            sizes |= dict(zip(letters, array.shape, strict=True))
+            object.__setattr__(self, name, array)
         if self.available is not None:
-            mask = array_of("available", self.available, *u.shape[:2])
+            mask = array_of("available", self.available, sizes["episodes"], sizes["M"])
             require_none(~np.isin(mask, (0, 1)), mask, "available must be 1 or 0")
             object.__setattr__(self, "available", mask == 1)
-        if self.ranges is not None and len(self.ranges.low) != u.shape[2]:
+        if self.ranges is not None and len(self.ranges.low) != self.num_inputs:
             raise ValueError(
-                f"ranges must hold {u.shape[2]} numbers, got {len(self.ranges.low)}"
+                f"ranges must hold {self.num_inputs} numbers, got "
+                f"{len(self.ranges.low)}"
             )
 
     @property
     def num_episodes(self) -> int:
-        """E."""
         return self.candidates.shape[0]
 
     @property
     def num_candidates(self) -> int:
-        """M."""
         return self.candidates.shape[1]
 
     @property
     def num_inputs(self) -> int:
-        """n."""
         return self.candidates.shape[2]
 
     @property
     def num_outputs(self) -> int:
-        """m: that of ``measured``, or n where nothing was measured."""
+        """Axes of ``measured``, those of the inputs where nothing was measured."""
         return self.num_inputs if self.measured is None else self.measured.shape[2]
 
     def facts(self) -> dict[str, Any]:
         """Name, sizes and origin, as reports and JSON documents give them."""
-        return {
-            "name": self.name,
-            "episodes": self.num_episodes,
-            "num_candidates": self.num_candidates,
-            "num_inputs": self.num_inputs,
-            "num_outputs": self.num_outputs,
-            "seed": self.seed,
-            "sha256": self.sha256,
-        }
+        sizes = ("num_candidates", "num_inputs", "num_outputs", "seed", "sha256")
+        facts = {"name": self.name, "episodes": self.num_episodes}
+        return facts | {name: getattr(self, name) for name in sizes}
 
     def part(self, begin: int, end: int) -> Dataset:
         """Episodes ``begin`` to ``end``, the last one not included."""
-        held = {name: getattr(self, name) for name in ("measured", "available")}
-        cut = {
-            name: array[begin:end] for name, array in held.items() if array is not None
-        }
-        return dataclasses.replace(self, candidates=self.candidates[begin:end], **cut)
+        held = {name: getattr(self, name) for name in _KEYS}
+        cut = {k: array[begin:end] for k, array in held.items() if array is not None}
+        return dataclasses.replace(self, **cut)
+
+
+def load_dataset(path: str | os.PathLike[str]) -> Dataset:
+    """Read a .npz or .csv dataset.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: naming the file and the key, row or line at fault.
+    """
+    file = pathlib.Path(path)
+    data, ending = file.read_bytes(), file.suffix.lower()
+    sha256 = hashlib.sha256(data).hexdigest()
+    if ending == ".csv":  # its errors name the file
+        return Dataset(file.name, sha256=sha256, **_read_csv(os.fspath(path), data))
+    try:
+        if not data:
+            raise ValueError("the file is empty")
+        if ending != ".npz":
+            raise ValueError("a dataset must be a .npz or .csv file")
+        return Dataset(file.name, sha256=sha256, **_read_npz(data))
+    except ValueError as error:
+        raise ValueError(f"{os.fspath(path)}: {error}") from None
+
+
+def save_npz(dataset: Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a .npz atomically."""
+    held = {name: getattr(dataset, name) for name in _KEYS}
+    if dataset.ranges is not None:
+        held |= {"low": dataset.ranges.low, "high": dataset.ranges.high}
+    arrays = {name: array for name, array in held.items() if array is not None}
+    with atomic_write(path) as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def _read_npz(data: bytes) -> dict[str, Any]:
+    """The fields of a ``Dataset``."""
+    try:
+        archive = np.load(io.BytesIO(data), allow_pickle=False)
+    except Exception:  # zipfile and numpy raise ten kinds on bytes that are damaged
+        raise ValueError("not a .npz file, or truncated") from None
+    if not isinstance(archive, np.lib.npyio.NpzFile):
+        raise ValueError("a single array, not a .npz file")
+    with archive:
+        held = {k: _member(archive, k) for k in archive.files if k in (*_KEYS, *_ENDS)}
+        if "candidates" not in held:
+            keys = ", ".join(sorted(archive.files)) or "nothing"
+            raise ValueError(f'key "candidates" is missing, found {keys}')
+    ends = [held.pop(key) for key in _ENDS if key in held]
+    if len(ends) == 1:
+        raise ValueError('keys "low" and "high" must come together')
+    return held | ({"ranges": JointRanges(ends[0], ends[1])} if ends else {})
+
+
+def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[Any]:
+    try:
+        member: NDArray[Any] = archive[key]
+    except Exception as error:  # of many kinds, where bytes are damaged
+        if isinstance(error, ValueError) and "pickle" in str(error):
+            raise ValueError(
+                f'key "{key}" must be an array of numbers, not of objects (such as '
+                "ragged episodes)"
+            ) from None
+        raise ValueError(f'key "{key}" is damaged') from None
+    if member.dtype.kind not in "biuf":
+        raise ValueError(f'key "{key}" must hold numbers, got dtype {member.dtype}')
+    return member
+
+
+def save_csv(
+    dataset: Dataset,
+    path: str | os.PathLike[str],
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> None:
+    """Write a .csv atomically, every number with all its digits; ranges are not kept.
+
+    Args:
+        dataset: what to write.
+        path: of the file.
+        progress: told how many episodes of how many are written.
+
+    Raises:
+        OSError: the folder is missing, not writable or full.
+    """
+    n, m, mask = dataset.num_inputs, dataset.num_outputs, dataset.available
+    header = [*_LABELS, *(f"u_{axis_letter(i, n)}" for i in range(n))]
+    values = [dataset.candidates]
+    if dataset.measured is not None:
+        header += [f"y_{axis_letter(i, m)}" for i in range(m)]
+        values.append(dataset.measured)
+    header += [] if mask is None else [_MASK]
+    with atomic_write(path) as file:
+        text = io.TextIOWrapper(file, "utf-8", newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(header)
+        for e, episode in enumerate(zip(*values, strict=True)):
+            if e % 1000 == 0:
+                progress(f"write {os.path.basename(path)}", e, dataset.num_episodes)
+            for i, row in enumerate(np.concatenate(episode, axis=1).tolist()):
+                last = [] if mask is None else [int(mask[e, i])]
+                writer.writerow([e, i, *row, *last])
+        text.detach()
+
+
+def _read_csv(source: str, data: bytes) -> dict[str, Any]:
+    """The fields of a ``Dataset``; ``source`` is the file's name in errors."""
+    table = parse(source, data)
+    names = _columns(table)
+    values = table.columns(names)
+    for row, place in np.argwhere(
+        (values[:, :2] % 1 != 0) | (abs(values[:, :2]) > 2.0**53)
+    ):
+        raise ValueError(
+            f"{source}: line {table.lines[row]}, {names[place]} must be a whole number "
+            f"of at most 2^53, got {values[row, place]:g}"
+        )
+    order = np.lexsort(values[:, 1::-1].T)
+    labels = values[order, :2]
+    for place in np.flatnonzero((labels[1:] == labels[:-1]).all(axis=1)):
+        first, again = (table.lines[row] for row in order[place : place + 2])
+        raise ValueError(
+            f"{source}: line {again} repeats candidate {labels[place, 1]:.0f} of "
+            f"episode {labels[place, 0]:.0f} of line {first}"
+        )
+    episodes, counts = np.unique(labels[:, 0], return_counts=True)
+    for other in np.flatnonzero(counts != counts[0]):
+        raise ValueError(
+            f"{source}: every episode must have the same number of candidates: episode "
+            f"{episodes[0]:.0f} has {counts[0]}, episode {episodes[other]:.0f} has "
+            f"{counts[other]}"
+        )
+    shape = len(episodes), counts[0]
+    in_order = values[order].reshape(*shape, len(names))
+    u, y = (
+        [i for i, name in enumerate(names) if name.startswith(start)]
+        for start in (COMMANDS, MEASURED)
+    )
+    fields: dict[str, Any] = {"candidates": in_order[..., u]}
+    if y:
+        fields["measured"] = in_order[..., y]
+    if _MASK in table.labels:  # 0 and 1 alone, as save_csv writes it
+        table.columns([_MASK])
+    if (mask := table.available()) is not None:
+        fields["available"] = mask[order].reshape(shape)
+    return fields
+
+
+def _columns(table: Table) -> list[str]:
+    """All of them, the labels first."""
+    source, header = table.source, table.header
+    for name in _LABELS:
+        if name not in header or not table.headed:
+            raise ValueError(
+                f"{source}: column {name!r} is missing; columns: {', '.join(header)}"
+            )
+    if not any(name.startswith(COMMANDS) for name in header):
+        raise ValueError(f"{source}: no column of commands, such as u_x, in the header")
+    for name in header:
+        if name not in (*_LABELS, _MASK) and not name.startswith((COMMANDS, MEASURED)):
+            raise ValueError(f"{source}: unknown column {name!r}")
+    return [*_LABELS, *(name for name in header if name not in (*_LABELS, _MASK))]

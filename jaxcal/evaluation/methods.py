@@ -8,6 +8,7 @@ each draw counts as one selection in its statistics.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -19,8 +20,11 @@ from jaxcal import selection
 from jaxcal.checks import Array
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.parameters import estimate_parameters
-from jaxcal.evaluation.postures import PostureEvaluation, PostureResult
+from jaxcal.evaluation.postures import (
+    PostureEvaluation,
+    PostureResult,
+    estimate_parameters,
+)
 from jaxcal.information.regression import log_det_gram
 from jaxcal.models.affine import Affine
 from jaxcal.selection.problem import make_problems
@@ -95,10 +99,6 @@ def evaluate(
         time_limit: seconds for the exact solver over the whole dataset; episodes not
             proven by then are judged against an upper bound.
         progress: called as selections are made.
-
-    Raises:
-        ValueError: naming the dataset and what is wrong with it, k or a method.
-        OSError: a checkpoint cannot be read.
     """
     methods = check_methods(methods)
     for name, value in (("num", num), ("random_draws", random_draws)):
@@ -114,13 +114,10 @@ def evaluate(
         for method in methods
         for checkpoint in (checkpoints if method in POLICIES else (None,))
     ]
-    policies = {row: run.policy(*row) for row in rows if row[0] in POLICIES}
-    random = run.random(random_draws)
-    exact, reference, proven = run.exact(time_limit)
-    results = policies | {("random", None): random, ("exact", None): exact}
-    for row in rows:
-        if row not in results:
-            results[row] = run.solver(row[0])
+    results = {row: run.policy(*row) for row in rows if row[0] in POLICIES}
+    results["random", None] = random = run.random(random_draws)
+    results["exact", None], reference, proven = run.exact(time_limit)
+    results |= {row: run.solver(row[0]) for row in rows if row not in results}
     return PostureEvaluation(
         dataset=dataset,
         k=k,
@@ -152,9 +149,7 @@ class _Run:
     ) -> PostureResult:
         """Judge (E, R, k) indices, unless their (E, R) log det of Z.T Z is known."""
         if gram is None:
-            sets = self.dataset.candidates
-            values = [log_det_gram_of(sets[c], indices[c]) for c in self.pieces()]
-            gram = np.concatenate(values)
+            gram = log_det_gram_of(self.dataset.candidates, indices)
         return PostureResult(
             method=method,
             label=METHODS[method].format(num=self.num),
@@ -192,7 +187,6 @@ class _Run:
         return choices, seconds
 
     def policy(self, method: str, checkpoint: str | None) -> PostureResult:
-        """One decoding of one checkpoint."""
         from jaxcal.selection.policy import select_batch
 
         label = METHODS[method].format(num=self.num)
@@ -238,19 +232,16 @@ class _Run:
                 return selection.greedy_batch(**part).indices
             if method == "exchange":
                 return selection.exchange_batch(**part, seed=self.seed).indices
-            masks, m = part["available"], self.dataset.num_outputs
-            return np.array(
-                [
-                    selection.select(
-                        candidates,
-                        self.k,
-                        model=Affine(candidates.shape[1], m),
-                        available=None if masks is None else masks[i],
-                        seed=self.seed,
-                    ).indices
-                    for i, candidates in enumerate(part["candidates"])
-                ]
+            model = Affine(self.dataset.num_inputs, self.dataset.num_outputs)
+            sets, masks = part["candidates"], part["available"]
+            masks = [None] * len(sets) if masks is None else masks
+            auto = functools.partial(
+                selection.select, k=self.k, model=model, seed=self.seed
             )
+            selections = [
+                auto(u, available=m) for u, m in zip(sets, masks, strict=True)
+            ]
+            return np.array([selected.indices for selected in selections])
 
         choose(slice(0, 1))  # not timed: it may compile
         choices, seconds = self.timed(method, choose)

@@ -35,8 +35,7 @@ class PostureResult(MethodResult):
     parameters: Array | None  # (E, R, m (n + 1)) identified from the chosen postures
 
     @property
-    def log_det(self) -> Array:
-        """(E, R) log det S."""
+    def log_det(self) -> Array:  # (E, R)
         return self.values
 
 
@@ -63,10 +62,8 @@ class PostureEvaluation(Evaluation):
     random_log_det: Array  # (E, R) the baseline behind ratio_to_random
 
     def summarise(self, *, indices: bool = False) -> Summary:
-        """The numbers of every method.
-
-        With ``indices`` also what each chose in every episode (random: its first draw).
-        """
+        """The numbers of every method; with ``indices`` also what each chose in every
+        episode (random: its first draw)."""
         rows, data = self.rows(), self.dataset
         if indices:
             for row, result in zip(rows, self.results, strict=True):
@@ -117,13 +114,8 @@ class PostureEvaluation(Evaluation):
 def summary_of(
     facts: dict[str, Any], rows: tuple[MethodNumbers, ...], proven: int
 ) -> Summary:
-    """The summary of one dataset.
-
-    Args:
-        facts: for the JSON: dataset, k, seed, criterion.
-        rows: a method each.
-        proven: how many of the episodes' optima.
-    """
+    """The summary of one dataset, of which so many episodes' optima are ``proven``;
+    ``facts`` for the JSON: dataset, k, seed, criterion."""
     data, k = facts["dataset"], facts["k"]
     seed = "" if data["seed"] is None else f", seed {data['seed']}"
     heading = (
@@ -178,3 +170,46 @@ _COLUMNS: tuple[Column, ...] = (
     ("x random", lambda row: _or_dash(row.numbers["ratio_to_random"], ",.0f")),
     ("time each", lambda row: _time(row.numbers["seconds_per_selection"])),
 )
+
+
+def estimate_parameters(dataset: Dataset, indices: Indices) -> Array | None:
+    """Least-squares parameters of every selection; the batched ``jaxcal.identify``.
+
+    ``indices`` (E, R, k) -> (E, R, m (n + 1)) A row by row, then b; in the unit of
+    ``dataset.ranges`` where it has one, else in that of the candidates. None where
+    nothing was measured.
+    """
+    if dataset.measured is None:
+        return None
+    commands = dataset.candidates
+    if dataset.ranges is not None:
+        commands = dataset.ranges.denormalise(commands)
+    gather = indices[..., None]
+    u = np.take_along_axis(commands[:, None], gather, axis=2)
+    y = np.take_along_axis(dataset.measured[:, None], gather, axis=2)
+    return least_squares(u, y)
+
+
+def least_squares(commands: Array, measured: Array) -> Array:
+    """(..., m (n + 1)) A row by row, then b, of many sets of postures at once.
+
+    ``commands`` are (..., N, n), N > n and of full rank, ``measured`` (..., N, m).
+    """
+    mean_u = commands.mean(axis=-2, keepdims=True)
+    mean_y = measured.mean(axis=-2, keepdims=True)
+    q, r = np.linalg.qr(commands - mean_u)
+    slopes = np.linalg.solve(r, np.matrix_transpose(q) @ (measured - mean_y))
+    biases = (mean_y - mean_u @ slopes)[..., 0, :]
+    matrix = np.matrix_transpose(slopes)
+    return np.concatenate([matrix.reshape(*biases.shape[:-1], -1), biases], axis=-1)
+
+
+def predict(parameters: Array, commands: Array) -> Array:
+    """(..., N, m) outputs at (..., N, n) commands: the batched ``Calibration.predict``.
+
+    ``parameters`` are (..., m (n + 1)), as those of ``least_squares``.
+    """
+    n = commands.shape[-1]
+    m = parameters.shape[-1] // (n + 1)
+    matrix = parameters[..., : m * n].reshape(*parameters.shape[:-1], m, n)
+    return commands @ np.matrix_transpose(matrix) + parameters[..., None, m * n :]

@@ -40,7 +40,8 @@ def write_report(
     *,
     command: Sequence[str],
 ) -> int:
-    """Draw everything, then write each figure as SVG and PNG, and ``index.html`` last.
+    """Draw everything, then write each figure as SVG and PNG, and ``index.html`` last;
+    returns how many figures there are.
 
     Args:
         folder: made where it is missing.
@@ -48,9 +49,6 @@ def write_report(
         draw: figures of an evaluation by name, of ``jaxcal.evaluation.figures``.
         runs: folders of training runs to draw curves of.
         command: what was typed, for the record.
-
-    Returns:
-        How many figures there are.
     """
     files: dict[str, bytes] = {}
     summaries = [evaluation.summarise() for evaluation in evaluations]
@@ -63,7 +61,7 @@ def write_report(
         blocks += _drawn(draw(evaluation), files, prefix and f"{prefix}_")
         sections.append(Section(shown.heading, blocks))
     if runs:
-        from jaxcal.evaluation.training_figure import training_curves
+        from jaxcal.evaluation.figures import training_curves
 
         curves = {"training_curves": training_curves({run.name: run for run in runs})}
         sections.append(Section("Training", _drawn(curves, files)))
@@ -125,11 +123,7 @@ def _rows(shown: Summary) -> list[tuple[str, ...]]:
 
 def _checkpoints(shown: Summary) -> list[Any]:
     """The checkpoints of the policies, without repeats."""
-    checkpoints: list[Any] = []
-    for row in shown.rows:
-        if row.is_policy and row.checkpoint not in checkpoints:
-            checkpoints.append(row.checkpoint)
-    return checkpoints
+    return [*dict.fromkeys(row.checkpoint for row in shown.rows if row.is_policy)]
 
 
 def _entries(shown: Summary) -> list[dict[str, Any]]:

@@ -14,14 +14,11 @@ from jaxcal.checks import Array
 
 @dataclasses.dataclass(frozen=True)
 class _Named:
-    """Name and checkpoint of a method."""
-
     method: str  # as asked for: "greedy", "policy:first", ...
     checkpoint: Any  # of a policy, for the JSON; None: the shipped one, a baseline
 
     @property
     def is_policy(self) -> bool:
-        """True where a checkpoint chose."""
         return self.method.startswith("policy")
 
 
@@ -59,11 +56,7 @@ class MethodResult(_Named):
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Evaluation(abc.ABC):
-    """Methods on the same cases, case by case.
-
-    How a case is made and scored, and so the numbers, is the subclass's:
-    ``PostureEvaluation`` of candidate sets, ``DeciderEvaluation`` of sessions.
-    """
+    """Methods on the same cases; a subclass makes and scores them."""
 
     title: ClassVar[str]  # of the page
     about: ClassVar[str]  # what the columns mean
@@ -77,7 +70,6 @@ class Evaluation(abc.ABC):
         return result.values - self.reference[:, None]
 
     def rows(self) -> tuple[MethodNumbers, ...]:
-        """The numbers of every method."""
         return tuple(
             MethodNumbers(r.method, r.checkpoint, self.summary(r)) for r in self.results
         )

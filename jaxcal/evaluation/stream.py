@@ -37,8 +37,6 @@ def evaluate_stream(
 ) -> Summary:
     """Evaluate the first episodes of a dataset, resuming from the parts in a folder.
 
-    Processes that are given the same folder take parts in orders of their own.
-
     Args:
         draw: (begin, end) -> episodes; ``begin`` is a multiple of 1,000.
         episodes: how many.
@@ -46,11 +44,6 @@ def evaluate_stream(
         plan: JSON values: ``dataset``, and the arguments of ``evaluate``, ``methods``
             and ``seed`` among them. Parts of another plan are refused.
         progress: called as parts are completed.
-
-    Raises:
-        ValueError: the folder holds parts of another plan or of other versions, a part
-            is damaged, the plan is wrong, or a policy returned what it must not.
-        OSError: the folder cannot be read or written.
     """
     options = {name: value for name, value in plan.items() if name != "dataset"}
     options["methods"] = list(dict.fromkeys([*options["methods"], "random"]))
@@ -96,12 +89,8 @@ def evaluate_stream(
 
 
 def total(counts: list[int], parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """One row of all parts; a number that one of them lacks is lacking.
-
-    Args:
-        counts: episodes of each part.
-        parts: their rows: averages over their episodes, each with as many draws.
-    """
+    """One row of all parts, of ``counts`` episodes each; a number that one of their
+    rows lacks is lacking."""
 
     def mean(values: Any) -> float:
         return float(np.average(np.array(values, float), weights=counts))  # None: NaN

@@ -53,7 +53,6 @@ class EpisodeEnv(Env):
         )
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Take one step."""
         env = self.functional
         after, reward, done, metric = env.advance(state.pipeline_state, action)
         return state.replace(
@@ -113,20 +112,13 @@ def wrap_fresh(
     randomization_fn: Any = None,
 ) -> Wrapper:
     """The ``wrap_env_fn`` for brax's trainers: a new episode after every ``done``.
-
-    Args:
-        env: one episode.
-        episode_length, action_repeat: as brax passes them.
-        randomization_fn: must be None; there is no physical system to randomise.
-    """
+    ``randomization_fn`` must be None: there is no physical system to randomise."""
     if randomization_fn is not None:
         raise ValueError("randomization_fn must be None: there is no system to vary")
     return _FreshReset(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
 
 
 class _MaskedCategorical(distribution.ParametricDistribution):
-    """brax's distribution interface over logits that the network has masked."""
-
     def create_dist(self, parameters: jax.Array) -> Any:
         log_probs = jax.nn.log_softmax(parameters)
         entropy = -(jnp.exp(log_probs) * log_probs).sum(-1)
@@ -151,11 +143,9 @@ def brax_networks(
 ) -> Callable[..., PPONetworks]:
     """A ``network_factory`` for ``brax.training.agents.ppo.train``.
 
-    Args:
-        env: postures or a task.
-        network: (..., observation_size) -> masked logits (..., action_size) and value
-            (...,); ``env.functional.network()`` when None. brax trains two copies of
-            its weights, one for the policy and one for the value.
+    ``network``: (..., observation_size) -> masked logits (..., action_size) and value
+    (...,); ``env.functional.network()`` when None. brax trains two copies of its
+    weights, one for the policy and one for the value.
     """
     module = env.functional.network() if network is None else network
     blank = jnp.zeros((1, env.observation_size))

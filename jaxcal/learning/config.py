@@ -36,7 +36,6 @@ def setting(default: Any, help: str) -> Any:
 
 
 def settings_of(config: type) -> Iterator[Setting]:
-    """The fields of a configuration class that were made by ``setting``."""
     kinds: dict[Any, Any] = {kind.__name__: kind for kind in (bool, int, float, str)}
     for field in dataclasses.fields(config):
         if "help" in field.metadata:
@@ -45,11 +44,7 @@ def settings_of(config: type) -> Iterator[Setting]:
 
 
 def require(config: Any, rule: str, holds: Callable[[Any], bool], *names: str) -> None:
-    """Refuse a configuration in which one of the named fields breaks a rule.
-
-    Raises:
-        ValueError: naming the field, the rule and the value.
-    """
+    """Refuse a configuration in which one of the named fields breaks a rule."""
     for name in names:
         value = getattr(config, name)
         if not holds(value):
@@ -62,7 +57,6 @@ def path_of(thing: type) -> str:
 
 
 def run_file(path: str | pathlib.Path, name: str) -> Any:
-    """The module ``name`` that a Python file becomes when it is run."""
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None  # it is a Python file
     module = importlib.util.module_from_spec(spec)
@@ -186,12 +180,10 @@ class PPOConfig(abc.ABC):
 
     @property
     def played_per_update(self) -> int:
-        """Episodes or decisions (``unit``) of an update."""
         return int(getattr(self, f"{self.unit}_per_update"))
 
     @property
     def steps_per_update(self) -> int:
-        """Gradient steps in an update."""
         return self.num_epochs * self.num_minibatches
 
     @property
@@ -235,7 +227,6 @@ class EpisodesConfig(PPOConfig):
 
     @property
     def rows_per_update(self) -> int:
-        """Candidate sets of an update."""
         return self.episodes_per_update // self.episodes_per_set
 
 
@@ -256,7 +247,6 @@ class StreamsConfig(PPOConfig):
 
     @property
     def rows_per_update(self) -> int:
-        """Streams of an update."""
         return self.decisions_per_update // self.stream_length
 
 
@@ -284,12 +274,10 @@ class RunConfig(abc.ABC):
 
     @property
     def runs(self) -> list[dict[str, Any]]:
-        """``seed`` and the swept values of each run side by side."""
         return runs_of(self.seed, self.num_seeds, self.sweep)
 
     @property
     def num_runs(self) -> int:
-        """Runs side by side: seeds times swept values."""
         return len(self.runs)
 
     def as_meta(self) -> dict[str, Any]:

@@ -53,18 +53,12 @@ class JaxSingle(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """A new episode; without a seed the random numbers go on."""
         super().reset(seed=seed)
         key = jax.random.key(int(self.np_random.integers(2**31)))
         self._state, observation, self._mask = self._begin(key)
         return np.array(observation), {"action_mask": self.action_masks()}
 
     def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """One step.
-
-        Raises:
-            ValueError: there is no such action.
-        """
         if not self.action_space.contains(action):
             raise ValueError(
                 f"action must be a whole number in [0, {self.action_space.n}), got "
@@ -78,7 +72,6 @@ class JaxSingle(gymnasium.Env):
         return np.array(observation), reward, done, False, info
 
     def action_masks(self) -> Array:
-        """(num_actions,) bool, what may be chosen."""
         return np.array(self._mask)
 
 
@@ -119,7 +112,6 @@ class JaxVector(VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """New episodes; without a seed the random numbers go on."""
         if seed is not None:
             self._key = jax.random.key(seed)
         self._key, key = jax.random.split(self._key)
@@ -129,14 +121,6 @@ class JaxVector(VectorEnv):
         return obs, {"action_mask": mask}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """One step of every environment.
-
-        Args:
-            actions: (num_envs,) whole numbers.
-
-        Raises:
-            ValueError: they are of another shape.
-        """
         if np.shape(actions) != (self.num_envs,):
             raise ValueError(
                 f"actions must hold one per environment, ({self.num_envs},), got shape "
@@ -186,23 +170,14 @@ def _postures(sizes: dict[str, Any]) -> PosturesEnv:
 
 
 def posture(**sizes: Any) -> JaxSingle:
-    """The environment ``jaxcal/Postures-v0``; ``sizes`` as of ``postures``."""
     return JaxSingle(_postures(sizes))
 
 
 def postures(
     num_envs: int = 1, autoreset_mode: str | AutoresetMode = "SameStep", **sizes: Any
 ) -> JaxVector:
-    """The environment ``jaxcal/Postures-v0`` of many.
-
-    Args:
-        num_envs: how many.
-        autoreset_mode: see ``JaxVector``.
-        sizes: fields of ``SelectionConfig``.
-
-    Raises:
-        ValueError: a name that is none of them, or a value that it refuses.
-    """
+    """The environment ``jaxcal/Postures-v0`` of many, see ``JaxVector``; ``sizes`` are
+    fields of ``SelectionConfig``."""
     return JaxVector(_postures(sizes), num_envs, autoreset_mode)
 
 

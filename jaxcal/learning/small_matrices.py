@@ -16,14 +16,8 @@ _UNROLLED_ROWS = 16  # sums over at most so many rows are written out
 
 
 def cholesky(matrix: jax.Array) -> jax.Array:
-    """Lower Cholesky factor of small symmetric positive definite matrices.
-
-    Args:
-        matrix: (..., p, p). Pivots are kept positive, so the result is finite.
-
-    Returns:
-        (..., p, p) lower triangular.
-    """
+    """(..., p, p) lower Cholesky factor of small symmetric positive definite matrices
+    (..., p, p); pivots are kept positive, so it is finite."""
     p = matrix.shape[-1]
     rows = [[matrix[..., i, j] for j in range(i + 1)] for i in range(p)]
     lower = factored(rows)
@@ -34,8 +28,7 @@ def cholesky(matrix: jax.Array) -> jax.Array:
 
 
 def factored(rows: list[list[jax.Array]]) -> list[list[jax.Array]]:
-    """Lower Cholesky factor of a matrix held as rows of its lower triangle; pivots are
-    kept positive."""
+    """Lower Cholesky factor of a matrix held as rows of its lower triangle."""
     lower: list[list[jax.Array]] = []
     for i, row in enumerate(rows):
         done: list[jax.Array] = []
@@ -52,15 +45,8 @@ def factored(rows: list[list[jax.Array]]) -> list[list[jax.Array]]:
 
 
 def solve_lower(lower: jax.Array, rows: jax.Array) -> jax.Array:
-    """Solutions ``r`` of ``lower @ r = row`` for each row, by forward substitution.
-
-    Args:
-        lower: (..., p, p) lower triangular.
-        rows: (..., M, p) right-hand sides, one per row.
-
-    Returns:
-        (..., M, p).
-    """
+    """(..., M, p) solutions ``r`` of ``lower @ r = row`` for each of ``rows`` (..., M,
+    p), by forward substitution."""
     out: list[jax.Array] = []
     for j in range(lower.shape[-1]):
         value = rows[..., j]
@@ -71,15 +57,10 @@ def solve_lower(lower: jax.Array, rows: jax.Array) -> jax.Array:
 
 
 def log_det_gram(postures: jax.Array, present: jax.Array | None = None) -> jax.Array:
-    """Log-determinant of ``Z.T @ Z`` by Gram-Schmidt about the centroid.
+    """(...,) log-determinant of ``Z.T @ Z`` by Gram-Schmidt about the centroid.
 
-    Args:
-        postures: (..., K, n) commands, K > n.
-        present: (..., K) bool, the rows that count; all of them by default. At least
-            one must.
-
-    Returns:
-        (...,) natural log; finite also where the postures lie in one plane.
+    Finite also where the postures (..., K, n) lie in one plane. ``present`` (..., K)
+    bool says which count, at least one; all of them by default.
     """
     if present is None:
         present = jnp.ones(postures.shape[:-1], bool)
@@ -104,12 +85,8 @@ def log_det_gram(postures: jax.Array, present: jax.Array | None = None) -> jax.A
 
 
 def picked(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
-    """(..., K, n) chosen postures; the first candidate where nothing is chosen yet.
-
-    Args:
-        candidates: (..., M, n).
-        chosen: (..., K) int, -1 where nothing is chosen.
-    """
+    """(..., K, n) chosen postures of (..., M, n) candidates; the first candidate where
+    ``chosen`` (..., K) is -1."""
     # All callers use this same gather, so XLA merges equal ones.
     index = jnp.maximum(chosen, 0)[..., None]
     return jnp.take_along_axis(candidates, index, axis=-2, mode="clip")

@@ -2,39 +2,58 @@
 
 Commands are uniform within ``RANGES`` and stored normalised to [0, 1], as in the paper.
 The outputs of dataset3 are ``y = diag(scale) u + bias`` (Table 1) of the commands in
-degrees, with white Gaussian noise of ``NOISE_STD_DEG`` on every output. ``recordings``
-reads what 4 and 5 are made from.
+degrees, with white Gaussian noise of ``NOISE_STD_DEG`` on every output.
 
-Every block of 1,000 episodes of every simulated dataset has a random stream of its own,
-spawned from the seed, the dataset's number and the block's.
-So no dataset shares candidates with another, and asking for fewer episodes gives the
-first of them. Training draws from JAX's generator, a different generator.
+Every block of 1,000 episodes of every drawn dataset has a random stream of its own,
+spawned from the seed, the dataset's number and the block's: no dataset shares
+candidates with another, and fewer episodes are the first of them. Training draws from
+JAX's generator, a different one.
+
+Datasets 4 and 5 are what the rig recorded: the ``pairs.csv`` of ``jaxcal-rig collect``,
+one posture per line, commands under ``u_deg_pitch, u_deg_yaw, u_deg_roll`` and what the
+phone read under ``y_deg_...``. Beside ``dataset4.csv`` may stand a data card
+``dataset4.json`` whose ``ranges_deg`` say what [0, 1] stands for. The paper recorded
+550 postures and speaks of 100 x 50 and 1 x 50: so dataset4 is drawn from its pool, 50
+of 500 per episode; dataset5 is the first 50 postures of its own session.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
+import os
 import pathlib
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
+from jaxcal.candidates import JointRanges
+from jaxcal.checks import Array
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.paper.constants import (
-    BIAS_DEG,
-    BLOCK,
-    DRAWN,
-    EPISODES,
-    NAMES,
-    NOISE_STD_DEG,
-    NUM_CANDIDATES,
-    RANGES,
-    RECORDED,
-    SCALE,
-)
-from jaxcal.paper.recordings import recorded_dataset
+from jaxcal.tables import parse
 
-__all__ = ["BIAS_DEG", "SCALE", "chunks", "drawn", "make_dataset", "streams"]
+AXES = ("pitch", "yaw", "roll")
+SCALE = np.array([0.43, 0.71, 0.87])  # pitch, yaw, roll; Table 1 lists roll before yaw
+BIAS_DEG = np.array([3.1, -5.8, 2.41])
+NOISE_STD_DEG = 0.1  # ours; the paper gives none
+RANGES = JointRanges([-20.0] * 3, [20.0] * 3)  # degrees, ours as well
+
+EPISODES = {
+    "dataset0": 200,
+    "dataset1": 200_000,
+    "dataset2": 1_000,
+    "dataset3": 100,
+    "dataset4": 100,
+    "dataset5": 1,
+}
+NAMES = tuple(EPISODES)
+DRAWN = ("dataset1", "dataset2", "dataset3")
+RECORDED = ("dataset4", "dataset5")
+NUM_CANDIDATES = 50
+BLOCK = 1_000  # episodes of a drawn dataset that share a random stream
+SHIPPED = pathlib.Path(__file__).parent / "data"
 
 
 def make_dataset(
@@ -69,8 +88,8 @@ def chunks(
 
     Raises:
         OSError: a recording cannot be read.
-        ValueError: naming the argument, or the line of a recording; an argument is
-            refused before the first chunk is drawn.
+        ValueError: naming the argument, before the first chunk is drawn, or the line of
+            a recording.
     """
     if name == "dataset0":
         raise ValueError(
@@ -93,26 +112,17 @@ def chunks(
 
 
 def _joined(parts: list[Dataset]) -> Dataset:
-    measured = [part.measured for part in parts if part.measured is not None]
-    return dataclasses.replace(
-        parts[0],
-        candidates=np.concatenate([part.candidates for part in parts]),
-        measured=np.concatenate(measured) if measured else None,
-    )
+    arrays = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("candidates", "measured")
+        if getattr(parts[0], name) is not None
+    }
+    return dataclasses.replace(parts[0], **arrays)
 
 
 def drawn(name: str, seed: int, begin: int, end: int) -> Dataset:
-    """Episodes of a drawn dataset, of any length: the paper's size is not a limit.
-
-    Args:
-        name: one of ``DRAWN``.
-        seed: of the streams, 0 or greater.
-        begin: the first episode, a multiple of ``BLOCK``.
-        end: one after the last.
-
-    Raises:
-        ValueError: it is of another kind, which ends.
-    """
+    """Episodes ``begin``, a multiple of ``BLOCK``, to ``end`` of one of ``DRAWN``: of
+    any number, the paper's size is not a limit."""
     if name not in DRAWN:
         raise ValueError(
             f"a streamed dataset must be one of {', '.join(DRAWN)} (drawn from a seed "
@@ -138,3 +148,78 @@ def streams(
     key = (NAMES.index(name), block)
     draw, noise = np.random.SeedSequence(seed, spawn_key=key).spawn(2)
     return np.random.default_rng(draw), np.random.default_rng(noise)
+
+
+def recorded_dataset(
+    name: str, seed: int = 0, *, folder: str | os.PathLike[str] | None = None
+) -> Dataset:
+    """Episodes of the recording ``name``.csv in a folder, the shipped one when None.
+
+    With enough postures for every episode they are taken in the order they were
+    recorded; with fewer every episode is a draw without repeats, by the seed.
+    """
+    path = (SHIPPED if folder is None else pathlib.Path(folder)) / f"{name}.csv"
+    commands, measured, ranges, digest = read_pool(path)
+    episodes, have = EPISODES[name], len(commands)
+    if have < NUM_CANDIDATES:
+        raise ValueError(
+            f"{path}: an episode needs {NUM_CANDIDATES} postures, the recording has "
+            f"{have}"
+        )
+    if have >= episodes * NUM_CANDIDATES:
+        rows = np.arange(episodes * NUM_CANDIDATES).reshape(episodes, -1)
+    else:
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4,)))
+        rows = np.stack(
+            [rng.choice(have, NUM_CANDIDATES, replace=False) for _ in range(episodes)]
+        )
+    unit = ranges.normalise(commands)[rows]
+    return Dataset(name, unit, measured[rows], None, ranges, seed, digest)
+
+
+def read_pool(
+    path: str | os.PathLike[str],
+) -> tuple[Array, Array, JointRanges, str]:
+    """A recording in the order in which it was made.
+
+    Returns:
+        (N, 3) commands and (N, 3) readings in degrees, the ranges that [0, 1]
+        stands for, and the SHA-256 of the file.
+    """
+    file = pathlib.Path(path)
+    data = file.read_bytes()
+    ranges = _ranges_beside(file)
+    table = parse(os.fspath(path), data)
+    # Not the zero posture, which a session visits again to measure its drift.
+    roles = np.array(table.labels.get("role", [""] * len(table)))
+    used = roles != "reference"
+    columns = [f"{what}_deg_{axis}" for what in "uy" for axis in AXES]
+    values = table.columns(columns, used)[used]
+    unit = ranges.normalise(values[:, :3])
+    for row in np.flatnonzero(((unit < 0.0) | (unit > 1.0)).any(axis=1)):
+        low, high = ranges.low.tolist(), ranges.high.tolist()
+        raise ValueError(
+            f"{table.source}: posture {row + 1} is commanded "
+            f"{values[row, :3].tolist()} deg, outside the ranges {low} to {high}. If "
+            'those are too narrow, set "ranges_deg" in '
+            f"{file.with_suffix('.json').name}"
+        )
+    return values[:, :3], values[:, 3:], ranges, hashlib.sha256(data).hexdigest()
+
+
+def _ranges_beside(recording: pathlib.Path) -> JointRanges:
+    """The ranges its data card names; ours where there is none."""
+    card = recording.with_suffix(".json")
+    try:
+        document: Any = json.loads(card.read_text(encoding="utf-8"))
+        named = document.get("ranges_deg")
+        if named is None:
+            return RANGES
+        low, high = zip(*(named[axis] for axis in AXES), strict=True)
+        return JointRanges(low, high)
+    except FileNotFoundError:
+        return RANGES
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(
+            f'{card}: "ranges_deg" must give [low, high] of {", ".join(AXES)}: {error}'
+        ) from None

@@ -16,8 +16,6 @@ HEADS = ("actor", "critic_1", "critic_2")  # everything else is shared
 
 
 class Decision(NamedTuple):
-    """What a decision adds to the set."""
-
     context: jax.Array  # (..., 2 n + 4), see ``context_features``
     available: jax.Array  # (..., M) bool
 
@@ -37,7 +35,6 @@ class _Keys(nn.Module):
         self.bias = self.param("bias", nn.initializers.zeros, (self.width,))
 
     def __call__(self, poses: jax.Array) -> jax.Array:
-        """Keys (..., width) of encoded poses (..., width)."""
         keys = poses @ self.kernel
         return keys + jnp.broadcast_to(self.bias, keys.shape)
 
@@ -101,14 +98,12 @@ class PaperNetwork(Observing):
         self.critic_2 = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
 
     def encode(self, features: jax.Array) -> jax.Array:
-        """The candidates (..., M, width), encoded one by one."""
         poses = nn.relu(self.pose_1(2.0 * features - 1.0))
         return self.pose_norm(nn.relu(self.pose_2(poses)))
 
     def decode(
         self, memory: jax.Array, decision: Decision
     ) -> tuple[jax.Array, jax.Array]:
-        """Score the next choice: (..., M) masked logits and (...,) value."""
         context = nn.relu(self.context_1(decision.context))
         context = self.context_norm(nn.relu(self.context_2(context)))
         scale = self.config.width**-0.5

@@ -91,7 +91,6 @@ class ProductNetwork(Observing):
 
     @nn.compact
     def _logits(self, x: jax.Array, available: jax.Array) -> jax.Array:
-        """(..., M) masked logits."""
         width, rounds, p = self.config.width, self.config.decoder_rounds, x.shape[-1]
         free = available.astype(x.dtype)
         number = free.sum(-1, keepdims=True)
@@ -167,15 +166,9 @@ class _Product(nn.Module):
 def _attention(
     query: jax.Array, x: jax.Array, free: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Means of ``x`` weighted by powers of squared scores, and the largest of these.
-
-    Args:
-        query: (..., M, H p), of every candidate and head.
-        x: (..., M, p), whose last column is 1.
-        free: (..., M) 1 or 0, what is attended to.
-
-    Returns:
-        (..., M, H p) means; (..., M, H) log of the largest squared score.
+    """Means (..., M, H p) of x (..., M, p), whose last column is 1, weighted by powers
+    of squared scores with ``query`` (..., M, H p), and (..., M, H) log of the largest
+    of these; ``free`` (..., M) is 1 or 0, what is attended to.
     """
     *lead, m, _ = query.shape
     p = x.shape[-1]

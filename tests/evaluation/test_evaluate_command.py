@@ -18,8 +18,7 @@ import pytest
 from jaxcal.commands import evaluate as command
 from jaxcal.commands import tables
 from jaxcal.evaluation import figures, stream
-from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.dataset_files import save_csv, save_npz
+from jaxcal.evaluation.dataset import Dataset, save_csv, save_npz
 from jaxcal.information.regression import regression_matrix
 from jaxcal.paper.datasets import make_dataset
 from jaxcal.progress import Progress

@@ -18,17 +18,19 @@ from matplotlib.text import Text
 
 from jaxcal.evaluation import figures
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.figures import evaluation_figures
+from jaxcal.evaluation.figures import evaluation_figures, training_curves
 from jaxcal.evaluation.methods import check_methods, evaluate
-from jaxcal.evaluation.parameters import estimate_parameters
-from jaxcal.evaluation.postures import PostureEvaluation, PostureResult
+from jaxcal.evaluation.postures import (
+    PostureEvaluation,
+    PostureResult,
+    estimate_parameters,
+)
 from jaxcal.evaluation.report import (
     file_prefixes,
     json_document,
     text_table,
     write_report,
 )
-from jaxcal.evaluation.training_figure import training_curves
 from jaxcal.information.regression import regression_matrix
 from jaxcal.models import Affine
 from jaxcal.paper.datasets import make_dataset
@@ -403,7 +405,6 @@ def test_the_json_has_an_entry_for_each_checkpoint(shown: PostureEvaluation) -> 
 def test_figures_have_axes_units_and_legends(shown: PostureEvaluation) -> None:
     drawn = evaluation_figures(shown)
     assert set(drawn) == {
-        "first_selection",
         "det_per_episode",
         "det_means",
         "det_distributions",

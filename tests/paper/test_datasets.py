@@ -18,13 +18,13 @@ from hypothesis import strategies as st
 import jaxcal
 from benchmarks.paper.datasets import main, make_dataset
 from jaxcal.candidates import JointRanges
-from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.dataset_files import (
+from jaxcal.evaluation.dataset import (
+    Dataset,
     load_dataset,
     save_csv,
     save_npz,
 )
-from jaxcal.paper.constants import (
+from jaxcal.paper.datasets import (
     BIAS_DEG,
     EPISODES,
     NAMES,
@@ -32,9 +32,10 @@ from jaxcal.paper.constants import (
     RANGES,
     RECORDED,
     SCALE,
+    SHIPPED,
+    chunks,
+    read_pool,
 )
-from jaxcal.paper.datasets import chunks
-from jaxcal.paper.recordings import SHIPPED, read_pool
 
 # A loaded machine is no failure.
 settings.register_profile("patient", deadline=None)

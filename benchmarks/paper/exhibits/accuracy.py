@@ -24,9 +24,9 @@ from benchmarks.paper.exhibits.intervals import (
     share_interval,
 )
 from benchmarks.paper.exhibits.study import Study, commands_deg
-from jaxcal.evaluation.parameters import least_squares, predict
+from jaxcal.evaluation.postures import least_squares, predict
 from jaxcal.information.regression import regressors
-from jaxcal.paper.constants import NOISE_STD_DEG
+from jaxcal.paper.datasets import NOISE_STD_DEG
 from jaxcal.reports.plots.style import BLACK, band, numbered, panels, plain_log
 from jaxcal.selection import exchange_batch
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.paper.constants import BIAS_DEG, NOISE_STD_DEG, SCALE
+from jaxcal.paper.datasets import BIAS_DEG, NOISE_STD_DEG, SCALE
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxcal.paper.constants import AXES
+from jaxcal.paper.datasets import AXES
 
 Verdict = Literal["agrees", "agrees in part", "disagrees", "not comparable"]
 Columns = Mapping[str, Sequence[Any] | np.ndarray]

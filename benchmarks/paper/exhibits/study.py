@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from benchmarks.paper.datasets import make_dataset
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import Progress, evaluate
-from jaxcal.evaluation.parameters import least_squares
-from jaxcal.evaluation.postures import PostureEvaluation, PostureResult
+from jaxcal.evaluation.postures import PostureEvaluation, PostureResult, least_squares
 
 Array = NDArray[np.float64]
 

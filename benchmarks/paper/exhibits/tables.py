@@ -11,7 +11,7 @@ from benchmarks.paper.exhibits.exhibit import Exhibit, from_rows, judge
 from benchmarks.paper.exhibits.intervals import mean_interval
 from benchmarks.paper.exhibits.study import Study
 from jaxcal.information.regression import log_det_information, regression_matrix
-from jaxcal.paper.constants import EPISODES, NUM_CANDIDATES, RANGES
+from jaxcal.paper.datasets import EPISODES, NUM_CANDIDATES, RANGES
 
 
 def exhibits(study: Study) -> list[Exhibit]:

@@ -21,16 +21,13 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-_OWN = "every Network defines this; this class only declares it"
-_LAST = "a Network with num_unlearned > 0 defines this"
-
 
 class Network(nn.Module):
     """Scores candidates; features are trees of arrays."""
 
     @property
     def num_unlearned(self) -> int:
-        """Choices at the end of an episode that need no parameters."""
+        """Choices at the end of an episode that the look-ahead makes."""
         return 0
 
     @property
@@ -40,7 +37,7 @@ class Network(nn.Module):
 
     def candidate_features(self, candidates: jax.Array, usable: jax.Array) -> Any:
         """Features of sets (..., M, n); (..., M) bool usable: available or chosen."""
-        raise NotImplementedError(_OWN)  # abstract
+        raise NotImplementedError
 
     def decision_features(
         self,
@@ -58,19 +55,19 @@ class Network(nn.Module):
             count: () choices made: the number 0, or traced, so that decisions share a
                 program.
         """
-        raise NotImplementedError(_OWN)  # abstract
+        raise NotImplementedError
 
     def encode(self, features: Any) -> jax.Array:
         """(..., M, width) memory of a set."""
-        raise NotImplementedError(_OWN)  # abstract
+        raise NotImplementedError
 
     def decode(self, memory: jax.Array, decision: Any) -> tuple[jax.Array, jax.Array]:
         """(..., M) logits, masked, and (...,) value."""
-        raise NotImplementedError(_OWN)  # abstract
+        raise NotImplementedError
 
     def lookahead_logits(self, decision: Any) -> tuple[jax.Array, jax.Array]:
         """Logits as of ``decode``, for one of the last ``num_unlearned`` choices."""
-        raise NotImplementedError(_LAST)  # abstract
+        raise NotImplementedError
 
     def __call__(
         self, candidates: jax.Array, available: jax.Array, chosen: jax.Array
@@ -82,11 +79,8 @@ class Network(nn.Module):
 
 
 def initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
-    """Fresh parameters for M candidates of n inputs and K choices.
-
-    Raises:
-        ValueError: a method is missing, or logits and value have other shapes.
-    """
+    """Fresh parameters for M candidates of n inputs and K choices; a network that lacks
+    a method, or whose logits and value have other shapes, is refused."""
     kind = type(network)
     for name in ("candidate_features", "decision_features", "encode", "decode"):
         if getattr(kind, name, None) is getattr(Network, name):
@@ -110,12 +104,10 @@ def _initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
 
 
 def encode(network: Network, params: Any, features: Any) -> Any:
-    """Apply ``network.encode`` with given parameters."""
     return network.apply({"params": params}, features, method="encode")
 
 
 def decode(network: Network, params: Any, memory: jax.Array, decision: Any) -> Any:
-    """Apply ``network.decode`` with given parameters: logits and value."""
     return network.apply({"params": params}, memory, decision, method="decode")
 
 

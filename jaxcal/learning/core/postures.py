@@ -79,22 +79,19 @@ _ROOM = {"cpu": 2**29, "gpu": 2**33, "tpu": 2**33}
 
 
 def _at_once(number: int, m: int, each: int = 1) -> int:
-    """Largest divisor of ``number`` for whose (M, M) arrays, five of each, is room."""
     room = _ROOM.get(jax.default_backend(), 2**33)
     most = max(room // (20 * each * m * min(m, 1024)), 1)
     return max(d for d in range(1, number + 1) if number % d == 0 and d <= most)
 
 
 def _mapped(function: Callable[..., Any], at_once: int, leaves: Any) -> Any:
-    """``jax.vmap``, of so many at a time, one after another."""
     if at_once == len(jax.tree.leaves(leaves)[0]):
         return jax.vmap(function)(leaves)
     return jax.lax.map(function, leaves, batch_size=at_once)
 
 
 def _single(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-    """A function of no arguments whose numbers are float32, with 64 bits switched on
-    too."""
+    """``function`` without arguments, whose numbers are float32 with 64 bits on too."""
 
     def called() -> Any:
         return jax.tree.map(lambda x: x.astype(jnp.float32), function(*arguments))
@@ -103,7 +100,6 @@ def _single(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
 
 
 def _followed(first: jax.Array, others: jax.Array) -> jax.Array:
-    """(1 + T G, ...) from (1, ...) and (T, G, ...)."""
     return jnp.concatenate([first, others.reshape(-1, *others.shape[2:])])
 
 
@@ -116,12 +112,10 @@ class Postures:
     network: Network
 
     def init(self, key: jax.Array) -> Any:
-        """Parameters before training."""
         m, n = jax.eval_shape(self.task.reset, key).candidates.shape
         return initial(self.network, key, m, n, self.task.num_decisions)
 
     def with_config(self, config: EpisodesConfig) -> Postures:
-        """This learner with another configuration."""
         return dataclasses.replace(self, config=config)
 
     def begin(self, keys: jax.Array) -> jax.Array:
@@ -131,12 +125,9 @@ class Postures:
     def rollout(
         self, params: Any, rollout_state: jax.Array
     ) -> tuple[Batch, jax.Array, Metrics]:
-        """Play ``episodes_per_set`` episodes on a fresh set in each row.
-
-        Returns:
-            What was played, rows of decisions (T, G); the keys of the next update;
-            metrics: scalars, and ``rewards`` (B G,).
-        """
+        """Play ``episodes_per_set`` episodes on a fresh set in each row: rows of
+        decisions (T, G), the keys of the next update, metrics with ``rewards`` (B
+        G,)."""
         split = jax.vmap(lambda key: jax.random.split(key, 3))
         keys = split(
             jax.random.wrap_key_data(rollout_state)
@@ -164,7 +155,6 @@ class Postures:
     def loss(
         self, params: Any, experience: Batch, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """PPO loss of whole episodes."""
         score = jax.vmap(functools.partial(self._score, params))
         return surrogate(
             self.config, *score(experience.observations), experience, update_index
@@ -173,17 +163,13 @@ class Postures:
     def _score(
         self, params: Any, observations: RowInputs
     ) -> tuple[jax.Array, jax.Array]:
-        """(T, G, M) logits and (T, G) values in reward units of a row's decisions.
-
-        The set is encoded once, and so is the first decision.
-        """
+        """(T, G, M) logits and (T, G) values in reward units of a row's decisions."""
         memory = encode(self.network, params, observations.features)
         decide = functools.partial(decode, self.network, params, memory)
         scored = jax.vmap(decide)(observations.decisions)
         episodes = self.config.episodes_per_set
 
         def of_each(x: jax.Array) -> jax.Array:
-            """(T, G, ...) from (1 + (T - 1) G, ...)."""
             first = jnp.broadcast_to(x[:1], (episodes, *x.shape[1:]))
             whole = jnp.concatenate([first, x[1:]])
             return whole.reshape(-1, episodes, *x.shape[1:])
@@ -192,10 +178,8 @@ class Postures:
         return logits, value * self.task.value_scale
 
     def _play(self, params: Any, at_once: int, keys: jax.Array) -> tuple[Any, ...]:
-        """A ``Batch`` of one row; its (T, G) values; (G,) rewards, (G,) outcomes.
-
-        ``keys`` (2,) are of the set and of the actions.
-        """
+        """From keys (2,) of the set and of the actions: a ``Batch`` of one row; its (T,
+        G) values; (G,) rewards, (G,) outcomes."""
         task, network = self.task, self.network
         once = self.config.explore_once
         given = task.num_given if once else 0
@@ -277,10 +261,7 @@ class Postures:
         return batch, value, reward, jax.vmap(task.outcome)(state)
 
     def _advantages_and_targets(self, played: Metrics) -> tuple[jax.Array, jax.Array]:
-        """Advantages and value targets of every decision, (K, G) each.
-
-        ``played`` holds (K, G) values, rewards, and what was paid before.
-        """
+        """(K, G) each, of (K, G) values, rewards, and what was paid before."""
         # The baseline is the predicted total minus what was received before.
         rest = played["value"] - played["paid"]
         next_value = jnp.concatenate([rest[1:], jnp.zeros_like(rest[:1])])

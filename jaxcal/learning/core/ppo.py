@@ -42,7 +42,7 @@ class Learner(Protocol):
     """
 
     def __hash__(self) -> int:
-        """Hashable, as a static argument of ``jit``."""
+        """Hashable: a static argument of ``jit``."""
 
     def with_config(self, config: Any) -> Learner:
         """This learner with a configuration of which ``TRACED`` may be arrays."""
@@ -56,11 +56,8 @@ class Learner(Protocol):
     def rollout(
         self, params: Any, rollout_state: Any, *given: Any
     ) -> tuple[Any, Any, Metrics]:
-        """Play a row of experience for each of ``rollout_state``, leaves (B, ...).
-
-        Returns:
-            Rows, leaves (B, ...); what goes on from there; metrics.
-        """
+        """Play a row for each of ``rollout_state``, leaves (B, ...): rows, leaves (B,
+        ...); what goes on from there; metrics."""
 
     def loss(
         self, params: Any, experience: Any, update_index: jax.Array
@@ -88,15 +85,10 @@ def advantages(
 ) -> jax.Array:
     """(T, ...) generalised advantage estimates.
 
-    ``A_t = d_t + discount lambda goes_on_t A_(t+1)``, where ``d_t = reward_t + discount
-    following_t - value_t``.
-
-    Args:
-        config: discount and lambda.
-        reward: (T, ...) of each decision.
-        value: (T, ...) before each decision.
-        next_value: (T, ...) value expected after it, 0 where an episode ends.
-        continues: (T, ...) 0 where an episode ends with the decision, else 1.
+    ``A_t = d_t + discount lambda continues_t A_(t+1)``, where ``d_t = reward_t +
+    discount next_value_t - value_t``. All are (T, ...): ``value`` before each decision,
+    ``next_value`` expected after it, ``continues`` 0 where an episode ends with it,
+    else 1.
     """
     deltas = reward + config.discount * next_value - value
 
@@ -121,7 +113,7 @@ def normalised(config: PPOConfig, batch: Batch) -> Batch:
 
 
 def explained_variance(target: jax.Array, value: jax.Array) -> jax.Array:
-    """() share of the targets' variance that the values explain; at most 1."""
+    """() share of the targets' variance that the values explain."""
     return 1.0 - (target - value).var() / jnp.maximum(target.var(), 1e-12)
 
 
@@ -136,8 +128,7 @@ def surrogate(
 
     Args:
         config: coefficients and limits.
-        logits: (B, T, ..., A) of the decisions in ``batch``, masked by a large finite
-            minimum or -inf.
+        logits: (B, T, ..., A), masked by a large finite minimum or -inf.
         value: (B, T, ...) reward units.
         batch: what was played.
         update_index: () updates made; the entropy bonus follows it.
@@ -180,13 +171,8 @@ class TrainState:
 def begin(
     config: PPOConfig, learner: Learner, key: jax.Array, *given: Any, **values: Any
 ) -> TrainState:
-    """The state before the first update, from the key of a run.
-
-    Args:
-        config, learner, given: as for ``make_update``.
-        key: () PRNG key.
-        values: () arrays by names in ``TRACED``, in place of the configuration's.
-    """
+    """The state before the first update, from the () key of a run; ``values`` are ()
+    arrays by names in ``TRACED``, in place of the configuration's."""
     if unknown := sorted(set(values) - set(TRACED)):
         raise ValueError(f"values must be of {', '.join(TRACED)}, got {unknown[0]}")
     key_weights, key_updates = jax.random.split(key)
@@ -206,7 +192,6 @@ def begin(
 
 
 def _with_values(config: PPOConfig, values: Metrics) -> PPOConfig:
-    """The configuration with other values, unchecked: they may be traced."""
     changed = copy.copy(config)
     for name, value in values.items():
         object.__setattr__(changed, name, value)
@@ -237,13 +222,8 @@ def optimiser(config: PPOConfig) -> optax.GradientTransformation:
 def descend(
     config: PPOConfig, state: TrainState, grads: Any
 ) -> tuple[TrainState, jax.Array]:
-    """One gradient step: clipped by the global norm, Adam, averaged weights.
-
-    ``grads`` are a tree as ``state.params``, or one vector of all its leaves.
-
-    Returns:
-        The next state, and the () norm before clipping.
-    """
+    """One gradient step on ``grads``, a tree as ``state.params`` or one vector of all
+    its leaves: the next state, and the () norm before clipping."""
     grads = ravel_pytree(grads)[0]
     norm = jnp.linalg.norm(grads)
     # One factor: optax divides each gradient by the norm, which XLA does not fuse with
@@ -286,12 +266,8 @@ def mean_over(
 ) -> Any:
     """Mean of a function of rows, computed for ``size`` rows of each block at a time.
 
-    Args:
-        function: rows (blocks * size, ...) -> arrays.
-        rows: leaves (blocks, ...).
-        index: (blocks, n) which rows of each block; n is a multiple of ``size``.
-        size: rows of a block in a call of the function.
-        mesh: whose axis ``sets`` the blocks are spread over.
+    Rows have leaves (blocks, ...), spread over the mesh; ``index`` (blocks, n) says
+    which of each block, n a multiple of ``size``.
     """
 
     def of_part(part: jax.Array) -> Any:
@@ -316,16 +292,12 @@ def make_update(
 ) -> Callable[..., tuple[TrainState, Metrics]]:
     """One update: play, then epochs of minibatches; pure, not compiled.
 
-    On a mesh every device plays some of the rows and keeps them: of each minibatch it
-    draws an equal part from its own, and gradients alone are summed over the devices.
+    On a mesh with the one axis ``sets`` every device plays some of the rows and keeps
+    them: of each minibatch it draws an equal part from its own, and gradients alone are
+    summed over the devices.
 
     An update in which a loss or a gradient is not finite is skipped: weights and
     optimiser are as they were, and the metric ``skipped`` is 1; what is played goes on.
-
-    Args:
-        config: the optimisation.
-        learner: what is trained.
-        mesh: with the one axis ``sets``; None for one device.
 
     Returns:
         (state, *given) -> the next state and metrics.

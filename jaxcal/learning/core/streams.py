@@ -87,11 +87,9 @@ class Streams:
     network: nn.Module  # of what is observed: masked logits (..., A), values (...)
 
     def with_config(self, config: StreamsConfig) -> Streams:
-        """This learner with another configuration."""
         return dataclasses.replace(self, config=config)
 
     def init(self, key: jax.Array, task: Any) -> Any:
-        """Parameters before training."""
         state = self.environment.reset(task, key)
         return self.network.init(key, self.environment.observe(task, state, key))
 
@@ -108,10 +106,8 @@ class Streams:
     def rollout(
         self, params: Any, rollout_state: Stream, task: Any
     ) -> tuple[Batch, Stream, Metrics]:
-        """Play ``stream_length`` further decisions of each stream.
-
-        The metrics are means over the sessions that ended in them; NaN where none did.
-        """
+        """Play ``stream_length`` further decisions of each stream; metrics are means
+        over the sessions that ended in them, NaN where none did."""
         play = jax.vmap(self._play, in_axes=(None, 0, None))
         batch, value, rollout_state, ended = play(params, rollout_state, task)
         over, reward, choices = (x.sum() for x in ended)
@@ -125,7 +121,6 @@ class Streams:
     def loss(
         self, params: Any, experience: Batch, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """PPO loss of some streams."""
         logits, value = cast(Any, self.network.apply(params, experience.observations))
         return surrogate(self.config, logits, value, experience, update_index)
 

@@ -123,7 +123,6 @@ class FunctionalEnv(abc.ABC):
 
     @property
     def observation_size(self) -> int:
-        """Length of an observation."""
         return int(self._shape(self.observation).shape[0])
 
     def _shape(self, function: Any) -> Any:
@@ -169,18 +168,15 @@ class FunctionalEnv(abc.ABC):
 
     @property
     def name(self) -> str:
-        """Name of the environment."""
         return type(self).__name__
 
     @property
     def default_params(self) -> EnvParams:
-        """Parameters that cut nothing off."""
         return EnvParams(self.longest)
 
     def reset_env(
         self, key: jax.Array, params: EnvParams | None = None
     ) -> tuple[jax.Array, Any]:
-        """Observation and state of a new episode."""
         state = self.begin(key)
         return self.observation(state), state
 
@@ -199,7 +195,6 @@ class FunctionalEnv(abc.ABC):
     def observe(
         self, key: Any, state: Any, action: Any = None, params: Any = None
     ) -> jax.Array:
-        """``observation`` of a state."""
         return self.observation(state)
 
     def is_truncated(self, state: Any, params: EnvParams | None = None) -> jax.Array:
@@ -304,8 +299,6 @@ class PosturesEnv(FunctionalEnv):
 
 
 class _PosturesNetwork(nn.Module):
-    """A network of postures whose input is the paper's observation."""
-
     env: SelectionConfig
     config: NetworkConfig
 

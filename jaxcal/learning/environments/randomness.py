@@ -21,10 +21,8 @@ _PARITY = 0x1BD11BDA
 def uniform(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     """float32 in [0, 1), bit for bit those of ``jax.random.uniform(key, shape)``.
 
-    Args:
-        key: () typed key, or a legacy (2,) uint32 one. A key of another generator than
-            Threefry goes to ``jax.random.uniform``.
-        shape: of the result; fewer than 2^32 numbers.
+    ``key`` is typed or a legacy (2,) uint32 one; one of another generator than Threefry
+    goes to ``jax.random.uniform``. ``shape`` holds fewer than 2^32 numbers.
     """
     if not _is_plain_threefry(key):
         return jax.random.uniform(key, shape, jnp.float32)
@@ -46,7 +44,6 @@ def uniform(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 
 def _is_plain_threefry(key: jax.Array) -> bool:
-    """Whether it is a Threefry key and ``jax_threefry_partitionable`` is on."""
     typed = jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
     default = getattr(jax.config, "jax_default_prng_impl", "")
     name = str(jax.random.key_impl(key)) if typed else default

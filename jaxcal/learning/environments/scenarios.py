@@ -27,11 +27,8 @@ def given(
 ) -> CandidateSource:
     """A given set, drawn for every episode; of a single set (a pool), M of its rows.
 
-    Args:
-        config: sizes.
-        sets: (B, M, n) candidates; or (1, N, n), of which every episode draws M that
-            are available, without replacement.
-        available: (B, M) bool; all when None.
+    ``sets`` (B, M, n) with ``available`` (B, M) bool, all when None; or (1, N, n), of
+    which every episode draws M that are available, without replacement.
     """
     points = np.asarray(sets, np.float32)
     masks = np.ones(points.shape[:2], bool) if available is None else available
@@ -59,7 +56,6 @@ def given(
 
 
 def _shape(name: str, key: jax.Array, m: int, n: int) -> jax.Array:
-    """(M, n) candidates of one shape, of order one in size."""
     if name == "uniform":
         return randomness.uniform(key, (m, n))
     if name == "gaussian":
@@ -93,11 +89,9 @@ def mixture(
 ) -> CandidateSource:
     """Candidates of a shape drawn at random for every episode.
 
-    Args:
-        config: sizes.
-        shapes: names from ``SHAPES``; repeat one to weight it.
-        masked: greatest share of candidates made unavailable; the share is uniform
-            between 0 and this for every episode. At least ``num_selected + 4`` stay.
+    ``shapes`` are from ``SHAPES``, a repeated one weighs more. The share of candidates
+    made unavailable is uniform between 0 and ``masked``; at least ``num_selected + 4``
+    stay.
     """
     unknown = [name for name in shapes if name not in SHAPES]
     if not shapes or unknown:

@@ -77,14 +77,8 @@ def start(
 def reset(
     key: jax.Array, config: SelectionConfig, draw: CandidateSource | None = None
 ) -> SelectionState:
-    """A new episode with fresh candidates.
-
-    Args:
-        key: () PRNG key.
-        config: sizes and reward.
-        draw: where candidates come from (``scenarios`` has several); uniform in [0, 1]
-            on every axis when None.
-    """
+    """A new episode with fresh candidates of ``draw`` (``scenarios`` has several),
+    uniform in [0, 1] on every axis when None."""
     key_draw, key_next = jax.random.split(key)
     if draw is not None:
         return start(*draw(key_draw), config, key_next)
@@ -131,11 +125,8 @@ def step(
 
 
 def observe(state: SelectionState, config: SelectionConfig) -> jax.Array:
-    """The paper's observation, 210 numbers for M = 50 and n = 3 (Table 2).
-
-    Returns:
-        (n M + M + 2 n + 4,): poses; availability, 1 or 0; ``context_features``.
-    """
+    """(n M + M + 2 n + 4,) the paper's observation, 210 numbers for M = 50 and n = 3
+    (Table 2): poses; availability, 1 or 0; ``context_features``."""
     return jnp.concatenate(
         [
             state.candidates.ravel(),

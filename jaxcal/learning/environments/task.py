@@ -23,10 +23,8 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class GivenCandidates:
-    """The user's own candidates; a checkpoint holds their digest, not the values.
-
-    Two are equal where their digests are.
-    """
+    """The user's own candidates; a checkpoint holds their digest, by which two are
+    equal."""
 
     name: str = field(compare=False)  # of the file, for messages
     # (B, M, n) sets, or (1, N, n): a pool that every episode draws its M from. None
@@ -47,7 +45,6 @@ class GivenCandidates:
             raise ValueError("give the candidates: values or sha256, got neither")
 
     def source(self, config: SelectionConfig) -> CandidateSource:
-        """key -> the candidates of an episode, from the file's values."""
         if self.values is None:
             raise ValueError(
                 f"this run was trained on {self.name}: pass that file with --candidates"
@@ -81,7 +78,6 @@ class Task:
 
     @property
     def draw(self) -> CandidateSource:
-        """key -> (M, n) candidates and (M,) available."""
         if self.given is not None:
             return self.given.source(self.environment)
         from jaxcal.learning.environments import scenarios
@@ -90,7 +86,6 @@ class Task:
 
     @property
     def num_decisions(self) -> int:
-        """K, choices of an episode."""
         return self.environment.num_selected
 
     @property
@@ -99,7 +94,6 @@ class Task:
         return self.environment.reward_scale * self.environment.num_outputs
 
     def reset(self, key: jax.Array) -> SelectionState:
-        """A new episode with fresh candidates."""
         from jaxcal.learning.environments import selection
 
         return selection.reset(key, self.environment, self.draw)
@@ -107,7 +101,6 @@ class Task:
     def step(
         self, state: SelectionState, action: jax.Array
     ) -> tuple[SelectionState, jax.Array, jax.Array]:
-        """Choose one posture: the next state, () reward, () bool done."""
         from jaxcal.learning.environments import selection
 
         return selection.step(state, action, self.environment)
@@ -130,11 +123,7 @@ class Task:
 
     @staticmethod
     def from_meta(meta: dict[str, Any]) -> Task:
-        """The task that ``as_meta`` described; of given candidates only the digest.
-
-        Raises:
-            ValueError: it is of a class that is no longer there.
-        """
+        """The task that ``as_meta`` described; of given candidates only the digest."""
         meta = dict(meta)
         path = meta.pop("class", None)
         made: type[Task] = Task if path is None else named(path)

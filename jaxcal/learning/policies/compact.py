@@ -60,7 +60,6 @@ class _Round(nn.Module):
 
     @nn.compact
     def __call__(self, h: jax.Array, vectors: VectorFeatures) -> jax.Array:
-        """(..., M, width) from (..., M, width)."""
         width = self.width
         active = vectors.active[..., None].astype(h.dtype)
         u = nn.LayerNorm(name="norm")(h)
@@ -109,13 +108,11 @@ class CompactNetwork(Network):
 
     @property
     def num_unlearned(self) -> int:
-        """Choices at the end of an episode that are made without the network."""
         return min(self.config.lookahead, 2)
 
     def candidate_features(
         self, candidates: jax.Array, usable: jax.Array
     ) -> CandidateFeatures:
-        """The geometry of sets; arguments as in ``Network``."""
         whitened, offset = geometry.whiten(candidates, usable)
         depth = min(self.config.lookahead, whitened.shape[-1])
         close_up = self.config.close_up
@@ -129,14 +126,12 @@ class CompactNetwork(Network):
         available: jax.Array,
         count: jax.typing.ArrayLike,
     ) -> DecisionFeatures:
-        """The geometry of a decision; arguments as in ``Network``."""
         config = self.config
         return decision_features(
             features, chosen, available, count, config.lookahead, config.close_up
         )
 
     def encode(self, features: CandidateFeatures) -> jax.Array:
-        """Embed a set: (..., M, width)."""
         columns, active = features.vectors.columns, features.vectors.active
         size = jnp.log(jnp.maximum(active.sum(-1).astype(columns.dtype), 1.0) / 50.0)
         dimension = jnp.full_like(size, features.whitened.shape[-1] / 4.0 - 1.0)
@@ -151,11 +146,7 @@ class CompactNetwork(Network):
     def decode(
         self, memory: jax.Array, decision: DecisionFeatures
     ) -> tuple[jax.Array, jax.Array]:
-        """Score the next choice.
-
-        Returns:
-            (..., M) masked logits and (...,) value, in units of log det(Z.T Z).
-        """
+        """(..., M) masked logits and (...,) value, in units of log det(Z.T Z)."""
         h, vectors = memory, decision.vectors
         columns, active = vectors.columns, vectors.active
         mean = jnp.einsum("...m,...mw->...w", decision.chosen, h)
@@ -182,7 +173,6 @@ class CompactNetwork(Network):
     def lookahead_logits(
         self, decision: DecisionFeatures
     ) -> tuple[jax.Array, jax.Array]:
-        """Logits and value of a choice that needs no parameters."""
         vectors = decision.vectors
         logits = mask_logits(_SHARP * vectors.to_the_end, vectors.active)
         return logits, decision.reached

@@ -132,11 +132,9 @@ def _completed(
     begun: int,
     generators: Sequence[np.random.Generator],
 ) -> Indices:
-    """``chosen``, written, as ``free`` is, from position ``begun`` to the end.
-
-    The likeliest candidate at every step or, where generators are given, a draw from
-    the policy; each generator serves as many episodes in a row.
-    """
+    """``chosen``, written, as ``free`` is, from position ``begun`` to the end: the
+    likeliest candidate at every step or, where generators are given, a draw from the
+    policy, each for as many episodes in a row."""
     episodes = np.arange(len(chosen))
     for count in range(begun, chosen.shape[1]):
         scores = scorer.scores(memory, chosen, free, count, not generators)

@@ -77,16 +77,14 @@ def decision_features(
 ) -> DecisionFeatures:
     """Features of the decision after ``count`` choices, one count for the whole batch.
 
-    ``count`` may be traced: one program serves every decision of an episode.
-
     Args:
         features: of the set.
         chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
         available: (..., M) bool; at the number 0 of ``count`` those of the set itself,
             whose look-ahead is then that of the decision.
-        count: () choices made.
+        count: () choices made; may be traced: one program serves every decision.
         lookahead: most greedy choices to look ahead.
-        close_up: as for ``vector_features``.
+        close_up: adds the columns that tell near-equal look-aheads apart.
     """
     x = features.whitened
     p, total = x.shape[-1], chosen.shape[-1]
@@ -134,10 +132,7 @@ def vector_features(
     depth: jax.typing.ArrayLike,
     close_up: bool,
 ) -> VectorFeatures:
-    """Features of vectors y (..., M, p); arguments as in ``geometry.lookahead``.
-
-    ``close_up`` adds the columns that tell near-equal look-aheads apart.
-    """
+    """Features of vectors y (..., M, p); arguments as in ``geometry.lookahead``."""
     y = y * active[..., None].astype(y.dtype)
     number = jnp.maximum(active.sum(-1).astype(y.dtype), 1.0)
     square = (y * y).sum(-1)

@@ -24,11 +24,8 @@ _LEAST_GAIN = 1e-5  # of whitened vectors; smaller gains are float32 rounding er
 
 
 def whiten(candidates: jax.Array, usable: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Whitened regressors of a candidate set.
-
-    Args:
-        candidates: (..., M, n) commands.
-        usable: (..., M) bool, the candidates that count (available or chosen).
+    """Whitened regressors of candidates (..., M, n), of which ``usable`` (..., M)
+    count.
 
     Returns:
         (..., M, n + 1) vectors x with mean ``x x.T = I`` over the usable candidates,
@@ -51,15 +48,10 @@ def whiten(candidates: jax.Array, usable: jax.Array) -> tuple[jax.Array, jax.Arr
 def projected(
     x: jax.Array, chosen: jax.Array, count: jax.typing.ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
-    """Components of every vector orthogonal to the chosen ones.
+    """Components of every vector x (..., M, p) orthogonal to the chosen ones.
 
-    A chosen vector in the span of those before it is not projected out again.
-
-    Args:
-        x: (..., M, p).
-        chosen: (..., c, p) of which the first ``count`` are chosen so far, c <= p; the
-            others are zero.
-        count: () vectors chosen.
+    Of ``chosen`` (..., c, p), c <= p, the first ``count`` are chosen so far, the others
+    zero. One in the span of those before it is not projected out again.
 
     Returns:
         (..., M, p), whose squared lengths are the Schur-complement gains; and (...,)
@@ -90,7 +82,6 @@ def projected(
 
 
 def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
-    """Inner product of vectors held as lists of components."""
     total = a[0] * b[0]
     for left, right in zip(a[1:], b[1:], strict=True):
         total = total + left * right
@@ -100,12 +91,10 @@ def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
 def normalised_by(
     x: jax.Array, chosen: jax.Array, ridge: jax.typing.ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
-    """Every vector in the metric of the chosen: ``|y_i|^2 = x_i.T G^-1 x_i``.
+    """Every vector x (..., M, p) in the metric of the ``chosen`` (..., c, p).
 
-    Args:
-        x: (..., M, p).
-        chosen: (..., c, p) vectors chosen so far; zeros count nothing.
-        ridge: () ``G = C.T C + ridge I``; 0 needs vectors that span the space.
+    ``|y_i|^2 = x_i.T G^-1 x_i``, ``G = C.T C + ridge I``; a ridge of 0 needs vectors
+    that span the space, zeros among them count nothing.
 
     Returns:
         (..., M, p) vectors y: choosing i multiplies det G by ``1 + |y_i|^2``; and

@@ -26,11 +26,9 @@ class NetworkScorer:
         self._network, self._params = network, params
 
     def encode(self, rows: NDArray[Any], usable: NDArray[np.bool_]) -> Any:
-        """Features and memory of sets; rows are [command, 1]."""
         return _encoded(self._network, self._params, rows[..., :-1], usable)
 
     def part(self, memory: Any, sets: NDArray[np.int64]) -> Any:
-        """The memory as it is: ``scores`` shares a set's among its tries."""
         return memory
 
     def scores(
@@ -41,7 +39,6 @@ class NetworkScorer:
         count: int,
         best_only: bool = False,
     ) -> NDArray[Any]:
-        """(E, M) logits of episodes that are as many in a row on each set."""
         learned = chosen.shape[1] - count > self._network.num_unlearned
         tries = len(chosen) // len(jax.tree.leaves(memory)[0])  # in a row on each set
         choices, available = (
@@ -56,7 +53,6 @@ class NetworkScorer:
     def worth(
         self, rows: NDArray[Any], usable: NDArray[np.bool_], tries: NDArray[np.int64]
     ) -> NDArray[Any]:
-        """(B, T) of tries (B, T, K), log det(Z.T Z)."""
         return decoders.log_dets(rows, tries)
 
 
@@ -79,10 +75,7 @@ def scores_of(
     learned: bool,
 ) -> jax.Array:
     """(B, T, M) logits of the decision after ``count`` choices, T tries on each set.
-
-    ``learned`` is False for the last ``network.num_unlearned`` choices, which the
-    look-ahead makes.
-    """
+    ``learned`` is False for those that the look-ahead makes."""
     features, encoded = memory
 
     def of_try(chosen: jax.Array, free: jax.Array) -> jax.Array:
@@ -107,10 +100,8 @@ def choose(
     decoding: str = "greedy",
     num: int = 16,
 ) -> NDArray[np.int64]:
-    """(B, k) indices of (B, M, n) candidates; see ``decoding.choose``.
-
-    ``seeds`` (B,) are of the sets, for ``samples``; their numbers when None.
-    """
+    """(B, k) indices of (B, M, n) candidates; see ``decoding.choose``. ``seeds`` (B,)
+    are of the sets, for ``samples``; their numbers when None."""
     points, free = np.asarray(candidates), np.asarray(available)
     rows = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1)
     given = np.zeros((len(free), 0)) if required is None else required

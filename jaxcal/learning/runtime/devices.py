@@ -94,14 +94,8 @@ def is_first() -> bool:
 
 
 def on_first(function: Callable[[], T]) -> T:
-    """Call on process 0 alone; every process gets the result, or raises the same error.
-
-    Args:
-        function: returns what can be pickled, arrays among it.
-
-    Raises:
-        ValueError, OSError: what ``function`` raised.
-    """
+    """Call on process 0 alone; every process gets the result, which can be pickled, or
+    raises the same ValueError or OSError."""
     if jax.process_count() == 1:
         return function()
     answer: Any = None
@@ -130,10 +124,8 @@ def any_process(flag: bool) -> bool:
 
 
 def replicate(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
-    """Copy arrays that are the same in every process to every device of the mesh.
-
-    With ``axes``, leading axes of the arrays are spread over those of the mesh.
-    """
+    """Copy arrays that are the same in every process to every device of the mesh; with
+    ``axes`` their leading axes are spread over those of the mesh."""
     if mesh is None:
         return tree
     spread = PartitionSpec(*(axis for axis in axes if axis in mesh.axis_names))

@@ -27,8 +27,6 @@ _LEAVE_SECONDS = 3600  # for process 0 to write its files when the others are do
 
 @dataclasses.dataclass
 class Job:
-    """The flags that name a job."""
-
     TITLE: ClassVar = "several processes"
     ABOUT: ClassVar = "found automatically under SLURM, Open MPI and on Cloud TPU"
     RARE: ClassVar = True
@@ -41,11 +39,7 @@ class Job:
 
 
 def expected(job: Job, environ: Mapping[str, str] = os.environ) -> bool:
-    """Whether this process is one of several, or may be.
-
-    Raises:
-        ValueError: naming the flag, the rule and the value.
-    """
+    """Whether this process is one of several, or may be."""
     address, number, process_id = job.coordinator, job.num_processes, job.process_id
     if number == 1:
         return False
@@ -83,14 +77,8 @@ def _cluster(environ: Mapping[str, str]) -> bool:
 def run_job(
     program: str, argv: list[str] | None, work: Callable[[], int], advice: str
 ) -> int:
-    """Run a command that may be one process of a job; its exit code.
-
-    Args:
-        program: begins every message.
-        argv: its arguments; those of the process when None.
-        work: the command itself.
-        advice: how to go on when a process was lost.
-    """
+    """Run a command that may be one process of a job; its exit code. ``program`` begins
+    every message, ``advice`` says how to go on when a process was lost."""
     flags = Parser(add_help=False, exit_on_error=False).of(Job)
     try:
         job = values_of(flags.parse_known_args(argv)[0])["options"]
@@ -140,12 +128,7 @@ def collective() -> Iterator[None]:
 
 
 def _connect(job: Job) -> None:
-    """Join the job; must be called before JAX is initialised.
-
-    Raises:
-        ValueError: the job is not described completely.
-        RuntimeError: not every process came in time.
-    """
+    """Join the job; must be called before JAX is initialised."""
     import jax
 
     jax.config.update("jax_cpu_collectives_implementation", "gloo")

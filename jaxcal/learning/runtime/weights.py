@@ -39,12 +39,8 @@ def shipped(name: str = "default") -> pathlib.Path:
 def locate(checkpoint: str | pathlib.Path | None) -> pathlib.Path:
     """Path of a weights file, or of the newest complete step of a run.
 
-    Args:
-        checkpoint: a weights file, a training run's folder, its checkpoint folder or a
-            step in that; the policy of postures that ships when None.
-
-    Raises:
-        CheckpointError: there is no such file or folder, or no step in it.
+    ``checkpoint``: a weights file, a training run's folder, its checkpoint folder or a
+    step in that; the policy of postures that ships when None.
     """
     path = shipped() if checkpoint is None else pathlib.Path(checkpoint)
     if path.is_file() or (path / "meta" / "metadata").is_file():
@@ -96,12 +92,8 @@ def write(path: str | pathlib.Path, weights: Weights) -> None:
 
 
 def read(path: str | pathlib.Path) -> Weights:
-    """Read a weights file.
-
-    Raises:
-        CheckpointError: it is damaged, or not a weights file of this version.
-        OSError: it cannot be read.
-    """
+    """Read a weights file; CheckpointError where it is damaged or of another
+    version."""
     data = pathlib.Path(path).read_bytes()
     try:
         with np.load(io.BytesIO(data)) as file:

@@ -57,16 +57,9 @@ def train(
     say: Callable[[str], None],
     **more: Any,
 ) -> None:
-    """Train with ``brax.training.agents.ppo.train`` and save a checkpoint.
-
-    Of network and optimisation, the checkpoint's meta holds only what brax was given.
-
-    Args:
-        config: from ``adapted``.
-        folder: of the run.
-        say: called with each line of progress.
-        more: further arguments of brax's ``train``, such as ``num_evals``.
-    """
+    """Train with ``brax.training.agents.ppo.train`` and save a checkpoint, whose meta
+    holds only what brax was given. ``config`` is from ``adapted``, ``say`` gets each
+    line of progress, ``more`` are further arguments of brax's ``train``."""
     task, episodes = config.tasks[0], config.ppo.num_episodes
     env, length = task.environment, task.environment.num_selected
     read = {name: getattr(config.ppo, name) for name in _READ}

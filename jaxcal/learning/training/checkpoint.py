@@ -64,7 +64,6 @@ class Policy:
 
     @property
     def weights(self) -> Weights:
-        """The policy in plain arrays, for a file of weights."""
         return as_weights(self.params, self.meta)
 
 
@@ -76,7 +75,7 @@ def as_weights(params: Any, meta: dict[str, Any]) -> Weights:
 
 
 def _alone() -> Any:
-    """Options by which the calling process works alone, without the job's others."""
+    """Options by which the calling process works without the job's others."""
     own = jax.process_index()
     return ocp.options.MultiprocessingOptions(
         primary_host=own, active_processes={own}, barrier_sync_key_prefix=str(own)
@@ -157,7 +156,6 @@ class _TolerantLoop(asyncio.SelectorEventLoop):
     def call_soon_threadsafe(  # type: ignore[override]  # generic in its arguments
         self, *arguments: Any, **options: Any
     ) -> Any:
-        """asyncio's function, but nothing where the loop is closed."""
         if self.is_closed():
             return None
         return super().call_soon_threadsafe(*arguments, **options)
@@ -170,11 +168,8 @@ class _TolerantPolicy(asyncio.DefaultEventLoopPolicy):
 
 @contextlib.contextmanager
 def _quiet_after_failure() -> Iterator[None]:
-    """One error, where orbax and asyncio print many.
-
-    After one failed file orbax's others end in a thread of tensorstore when their event
-    loop is closed already; asyncio would print an error for each.
-    """
+    """After one failed file orbax's others end in a thread of tensorstore when their
+    event loop is closed; asyncio would print an error for each."""
     before, log = asyncio.get_event_loop_policy(), logging.getLogger("absl")
     level = log.level
     asyncio.set_event_loop_policy(_TolerantPolicy())
@@ -191,11 +186,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _read(path: pathlib.Path, like: Any, what: str) -> Any:
-    """A tree of arrays that orbax saved, of the shapes and types of ``like``.
-
-    Raises:
-        CheckpointError: it cannot be read, or has another shape.
-    """
+    """A tree of arrays that orbax saved, of the shapes and types of ``like``."""
     like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), like)
     options = _alone()
     try:
@@ -221,10 +212,7 @@ def read_meta(
 ) -> tuple[pathlib.Path, dict[str, Any]]:
     """A weights file or the newest complete step of a run, and its meta, checked.
 
-    Args:
-        checkpoint: a weights file, a training run's folder or its checkpoint folder;
-            the policy that ships when None.
-        schema: the schema that it must have.
+    ``checkpoint`` as of ``weights.locate``; ``schema`` is the one that it must have.
 
     Raises:
         CheckpointError: there is none, it is damaged, or holds something else.
@@ -254,14 +242,8 @@ def read_meta(
 
 
 def load(checkpoint: str | pathlib.Path | None = None) -> Policy:
-    """A policy of postures; with several seeds the best by validation.
-
-    Args:
-        checkpoint: as for ``read_meta``.
-
-    Raises:
-        CheckpointError: there is none, it is damaged, or another version made it.
-    """
+    """A policy of postures, ``checkpoint`` as for ``read_meta``; with several seeds the
+    best by validation."""
     path, meta = read_meta(checkpoint)
     try:
         network = build(NetworkConfig(**meta["network"]))
@@ -276,15 +258,8 @@ def load(checkpoint: str | pathlib.Path | None = None) -> Policy:
 
 
 def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
-    """The weights in a file or a step's folder, of the shapes of ``like``.
-
-    Args:
-        path, meta: from ``read_meta``.
-        like: weights of one policy; with several seeds the best is read.
-
-    Raises:
-        CheckpointError: they are damaged, of other shapes or not finite.
-    """
+    """The weights in a file or a step's folder, of the shapes of ``like``, one
+    policy's; with several seeds the best."""
     what = "read: its weights are damaged or do not fit the network"
     runs = len(runs_of(0, meta.get("num_seeds", 1), meta.get("sweep", ())))
     if path.is_file():
@@ -319,15 +294,8 @@ def restore(
 ) -> tuple[TrainState, dict[str, Any]]:
     """The training state of the newest whole step, and its meta.
 
-    A damaged step is warned of and renamed, and the one before it is read.
-
-    Args:
-        folder: of a run, or its checkpoint folder.
-        fresh: a state of the same structure, for shapes and types.
-        schema: of the run.
-
-    Raises:
-        CheckpointError: none, all are damaged, or one without a training state.
+    A damaged step is warned of and renamed, and the one before it is read. ``fresh`` is
+    a state of the same structure, for shapes and types.
     """
     newest = locate(folder)
     if not newest.name.isdigit():  # weights alone

@@ -86,7 +86,6 @@ class Lessons:
         self._asked: dict[int, Future[Lesson]] = {}
 
     def at(self, index: int) -> Lesson:
-        """The lesson of update ``index``."""
         for i in range(index, min(index + 2, self._last)):
             if i not in self._asked:
                 self._asked[i] = self._pool.submit(self._prepare, i)
@@ -115,15 +114,12 @@ class Imitation:
     postures: Postures
 
     def with_config(self, config: EpisodesConfig) -> Imitation:
-        """This learner with another configuration."""
         return Imitation(self.postures.with_config(config))
 
     def init(self, key: jax.Array, lesson: Lesson) -> Any:
-        """Parameters before training."""
         return self.postures.init(key)
 
     def begin(self, keys: jax.Array, lesson: Lesson) -> Any:
-        """A state as of ``postures``; a lesson reads none of it."""
         return self.postures.begin(keys)
 
     def rollout(
@@ -165,11 +161,8 @@ class Imitation:
     def loss(
         self, params: Any, experience: Attempt, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """Cross-entropy to the wanted postures, and the value's error.
-
-        Returns:
-            The loss, and metrics named as those of PPO.
-        """
+        """Cross-entropy to the wanted postures, and the value's error; metrics are
+        named as those of PPO."""
         attempt, config = experience, self.postures.config
         network = self.postures.network
         memory = encode(network, params, attempt.features)

@@ -72,14 +72,7 @@ def train(
         rest: ``resume``, ``report`` and ``should_stop`` of ``training.run.run``.
 
     Returns:
-        The last state; with several seeds each leaf has a leading axis of
-        ``config.num_seeds``.
-
-    Raises:
-        CheckpointError: nothing to resume from, or damaged.
-        ValueError: the devices do not divide a minibatch or the seeds evenly, the
-            teacher is missing, or the look-ahead makes every choice.
-        OSError: the folder cannot be written.
+        The last state; with several seeds each leaf has a leading axis of them.
     """
     rows = config.ppo.rows_per_minibatch
     mesh = devices.make_mesh(rows, num_devices, config.num_runs)
@@ -125,7 +118,6 @@ def _require_lessons(
     teacher: imitation.Teacher | None,
     imitated: int,
 ) -> None:
-    """Refuse imitation without a teacher, and a task that leaves nothing to learn."""
     if teacher is None and imitated:
         raise ValueError(f"teacher is missing: {imitated} updates imitate it")
     for task in config.tasks:

@@ -47,12 +47,10 @@ class TrainConfig(RunConfig):
 
     @property
     def num_imitated(self) -> int:
-        """Updates that imitate, before the others."""
         return round(self.imitation * self.ppo.num_updates)
 
     @property
     def learners(self) -> tuple[Postures, ...]:
-        """Learners of the tasks; update u trains number u modulo theirs."""
         from jaxcal.learning.core.postures import Postures
         from jaxcal.learning.policies.networks import build
 
@@ -69,7 +67,6 @@ class TrainConfig(RunConfig):
 
     @staticmethod
     def from_meta(meta: dict[str, Any]) -> TrainConfig:
-        """The configuration a checkpoint was trained with."""
         return TrainConfig(
             **{name: meta[name] for name in _PLAIN},
             **RunConfig.held_in(meta),
@@ -132,16 +129,11 @@ PARTS: dict[str, type] = {
 
 
 def names() -> list[str]:
-    """Presets of jaxcal and of installed packages."""
     return sorted({*_OWN, *installed(_GROUP)})
 
 
 def load(name: str) -> TrainConfig:
-    """A preset by its name.
-
-    Raises:
-        ValueError: no package offers a preset of this name.
-    """
+    """A preset by its name."""
     if name in _OWN:
         return _OWN[name]
     if name not in names():
@@ -159,15 +151,8 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     """A configuration with single fields changed, in whichever part they are.
 
     An environment field is changed in every task, and refused where tasks differ in it.
-    Where more than n + 1 postures are asked for, the reward becomes the increase of
-    log det S (``reward_gain``), so that an episode is paid what it is judged by.
-
-    Args:
-        config: where to start.
-        values: field name to value.
-
-    Raises:
-        ValueError: no part has such a field, or a part refuses the value.
+    Where more than n + 1 postures are asked for, the reward becomes the increase of log
+    det S (``reward_gain``), so that an episode is paid what it is judged by.
     """
     for name in sorted(set(values) - field_names()):
         raise ValueError(f"no configuration has the field {name}")

@@ -63,12 +63,10 @@ class Recipe:
 
     @functools.cached_property
     def learners(self) -> tuple[Learner, ...]:
-        """Learners of the run; update u trains number u modulo theirs."""
         return tuple(self.config.learners)
 
     @functools.cached_property
     def runs(self) -> list[dict[str, Any]]:
-        """Seed and swept values of each run side by side."""
         config = self.config
         return runs_of(config.seed, config.num_seeds, config.sweep)
 
@@ -97,8 +95,6 @@ _begun = jax.jit(ppo.begin, static_argnums=(0, 1))
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Values of a line of progress."""
-
     update: int
     played: int  # episodes or decisions
     seconds: float  # of training so far, before a resume included
@@ -207,9 +203,8 @@ def run(
         num_updates: stop after this update instead of at the end of the budget.
 
     Raises:
-        CheckpointError: nothing to resume from, or damaged.
-        DivergedError: losses are not finite in five updates in a row, in every run;
-            the weights before are saved. Fewer are skipped.
+        DivergedError: losses are not finite in five updates in a row, in every run; the
+            weights before are saved. Fewer are skipped.
         OSError: the folder cannot be written, or another training writes it.
     """
     last = recipe.config.ppo.num_updates if num_updates is None else num_updates
@@ -264,7 +259,6 @@ def run(
 
 
 def _broken(rows: Mapping[str, Any], number: int, update: int) -> str:
-    """What is not finite in row ``number``, and what to do."""
     losses = ("policy_loss", "value_loss", *_LOSSES)  # what to name first
     values = [
         (name, float(np.mean(rows[name][number]))) for name in losses if name in rows
@@ -279,11 +273,6 @@ def _broken(rows: Mapping[str, Any], number: int, update: int) -> str:
 
 @contextlib.contextmanager
 def _locked(root: pathlib.Path) -> Iterator[None]:
-    """The run's folder, made where missing, for this training alone.
-
-    Raises:
-        OSError: another training writes it.
-    """
     root.mkdir(parents=True, exist_ok=True)
     with (root / ".lock").open("a") as file:
         if not flock(file.fileno()):
@@ -406,7 +395,6 @@ class _Recorder:
         return self.before + now - self._begun
 
     def save(self, state: TrainState, done: int) -> None:
-        """Write a checkpoint of update ``done``."""
         recipe, config = self.recipe, self.recipe.config
         with atomic_write(self.root / "last_rewards.npy") as file:
             np.save(file, self.recent)
@@ -425,7 +413,6 @@ class _Recorder:
         checkpoint.save(self.root / "checkpoint", done, state.average, meta, state)
 
     def close(self) -> None:
-        """Sync the metrics to disk and close their files."""
         for file in filter(None, (self._rows, self._seeds)):
             file.flush()
             os.fsync(file.fileno())
