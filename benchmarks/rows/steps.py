@@ -34,7 +34,6 @@ from benchmarks.harness import (
     side_by_side,
 )
 from jaxcal.learning.brax import SelectionEnv, wrap_fresh
-from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.functional import PosturesEnv
 from jaxcal.learning.environments.selection import SelectionConfig
@@ -87,7 +86,7 @@ def ours(batch: int, episodes: int, options: dict[str, Any] | None = None) -> Ru
 
     def episode(carry: Any, key: jax.Array) -> tuple[Any, None]:
         states, seen, total = carry
-        units = randomness.uniform(key, (K, batch))
+        units = environment.uniform(key, (K, batch))
         return jax.lax.scan(step, (again(states), seen, total), units)[0], None
 
     @functools.partial(jax.jit, compiler_options=options)
@@ -119,7 +118,7 @@ def public(batch: int, episodes: int, options: dict[str, Any] | None = None) -> 
     def run(key: jax.Array) -> jax.Array:
         key_reset, key_act, key_step = jax.random.split(key, 3)
         begun = jax.vmap(env.reset)(jax.random.split(key_reset, batch))
-        units = randomness.uniform(key_act, (episodes * K, batch))
+        units = environment.uniform(key_act, (episodes * K, batch))
         drawn = jax.random.split(key_step, episodes * K), units
         obs, _, total = jax.lax.scan(step, (*begun, jnp.zeros(batch)), drawn)[0]
         return obs.sum() + total.sum()
@@ -146,7 +145,7 @@ def through_brax(
     def run(key: jax.Array) -> jax.Array:
         key_reset, key_act = jax.random.split(key)
         state = env.reset(jax.random.split(key_reset, batch))
-        units = randomness.uniform(key_act, (episodes * K, batch))
+        units = environment.uniform(key_act, (episodes * K, batch))
         state, total = jax.lax.scan(step, (state, jnp.zeros(batch)), units)[0]
         return state.obs.sum() + total.sum()
 

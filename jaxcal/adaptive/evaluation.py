@@ -30,7 +30,7 @@ from jaxcal.adaptive.session import jit_by_class
 from jaxcal.adaptive.tasks.registry import Entry
 from jaxcal.adaptive.tuning import tune
 from jaxcal.checks import Array
-from jaxcal.evaluation.results import Evaluation, MethodResult, Summary, finite
+from jaxcal.evaluation.report import Evaluation, MethodResult, Summary, finite
 
 METHODS = {
     "random": "any measurement",

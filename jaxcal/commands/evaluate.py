@@ -27,7 +27,7 @@ from jaxcal.files import require_kept, require_writable_folder, write_text
 
 if TYPE_CHECKING:
     from jaxcal.evaluation.dataset import Dataset
-    from jaxcal.evaluation.results import Evaluation, Summary
+    from jaxcal.evaluation.report import Evaluation, Summary
     from jaxcal.progress import Progress
 
 
@@ -360,7 +360,7 @@ def _streamed(
     options: EvaluateOptions, methods: Sequence[str], progress: Progress
 ) -> Iterator[tuple[Summary, None]]:
     assert options.stream is not None  # it was given
-    from jaxcal.evaluation.stream import evaluate_stream
+    from jaxcal.evaluation.methods import evaluate_stream
     from jaxcal.paper.datasets import drawn
 
     whole = {

@@ -3,8 +3,7 @@
 from jaxcal.evaluation.dataset import Dataset, load_dataset, save_csv, save_npz
 from jaxcal.evaluation.methods import evaluate
 from jaxcal.evaluation.postures import PostureEvaluation
-from jaxcal.evaluation.report import text_table
-from jaxcal.evaluation.results import Evaluation, Summary
+from jaxcal.evaluation.report import Evaluation, Summary, text_table
 
 __all__ = [
     "Dataset",

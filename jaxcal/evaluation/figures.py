@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 
 from jaxcal.checks import Array
 from jaxcal.evaluation.postures import PostureEvaluation, PostureResult, log_mean
-from jaxcal.evaluation.results import MethodResult
+from jaxcal.evaluation.report import MethodResult
 from jaxcal.models.affine import Affine
 from jaxcal.reports.plots.style import (
     BLACK,
@@ -40,13 +40,7 @@ _FIXED: dict[str, dict[str, Any]] = {  # the style of random and exact in every 
 
 def evaluation_figures(evaluation: PostureEvaluation) -> dict[str, Figure]:
     """Every figure the evaluation holds data for, by file name without suffix."""
-    drawn = [
-        det_per_episode,
-        det_means,
-        det_distributions,
-        gap_to_optimum,
-        best_so_far,
-    ]
+    drawn = [det_per_episode, det_means, det_distributions, gap_to_optimum, best_so_far]
     if evaluation.dataset.measured is not None:
         drawn.append(parameter_variance)
     return {draw.__name__: draw(evaluation) for draw in drawn}

@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from jaxcal.checks import Array
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.results import (
+from jaxcal.evaluation.report import (
     Column,
     Evaluation,
     MethodNumbers,

@@ -1,11 +1,8 @@
 """Posture selection as an environment in JAX, and the training of policies for it.
 
-``reset``, ``step`` and ``observe`` are pure functions of one episode; ``jax.vmap``
-makes a batch; ``PosturesEnv`` has them as gymnax users write them. ``make_train`` gives
-a whole training as one pure function. A network, a reward or another environment of
-one's own is a ``Learner``: ``Postures`` plays episodes of a ``Task`` with a
-``Network``, ``Streams`` sessions of an ``Environment``. Names load on first use, since
-inference without JAX imports this package too.
+``reset``, ``step`` and ``observe`` are pure functions of one episode, ``PosturesEnv``
+has them as gymnax users write them, ``make_train`` gives a whole training. Names load
+on first use, since inference without JAX imports this package too.
 """
 
 from __future__ import annotations
@@ -89,21 +86,14 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'jaxcal.learning' has no attribute {name!r}")
 
 
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
-
-
 def make_train(config: Any) -> Any:
     """A whole training as one pure function, to be jitted, scanned or vmapped.
-
-    ``train = make_train("compact")``, then ``state, metrics =
-    jax.jit(train)(jax.random.key(0))``; ``state.average`` is the policy. ``jax.vmap``
-    of it trains several keys, or learning rates, side by side.
 
     Args:
         config: the name of a preset, a ``TrainConfig``, or any object with ``ppo`` and
             ``learners``, of which update u trains number u modulo theirs; or one
-            learner, such as ``Postures(ppo, task, network)``.
+            learner, such as ``Postures(ppo, task, network)``. None that imitates a
+            teacher.
 
     Returns:
         ``train(key, *given, **values)`` -> the last state, whose ``average`` are the
@@ -111,10 +101,6 @@ def make_train(config: Any) -> Any:
         ``config.ppo.num_updates``. ``given``: none for postures, the arrays of a task
         for streams. ``values``: arrays in place of the configuration's learning rate,
         entropy bonus, clipping and others (``learning.config.TRACED``).
-
-    Raises:
-        ValueError: it is none of these, no preset has the name, or it imitates a
-            teacher.
     """
     from jaxcal.learning.core import ppo
     from jaxcal.learning.training import presets

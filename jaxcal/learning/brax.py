@@ -1,11 +1,7 @@
 """Episodes as ``brax.envs.base.Env``, and what brax's trainers need; this loads brax.
 
-``train`` is the call of brax's PPO, for ``train.py --trainer brax`` and for scripts.
-``env`` is a ``SelectionEnv`` of postures, or a ``SequentialEnv`` of a task from
-``jaxcal.adaptive.brax_env``. Masked options are never sampled: the network masks them
-from what is observed. ``done`` is 1 on the last step: an episode ends, it is never cut
-off, so brax's ``truncation`` stays 0. brax's own ``AutoResetWrapper`` replays the first
-episode; ``wrap_fresh`` draws a new one every time.
+The network masks what may not be chosen, from what is observed. ``done`` is 1 on the
+last step: an episode ends, it is never cut off, so brax's ``truncation`` stays 0.
 """
 
 from __future__ import annotations
@@ -28,8 +24,6 @@ from brax.training.agents.ppo.networks import PPONetworks
 from brax.training.networks import FeedForwardNetwork
 
 from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv, renewed
-from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
-from jaxcal.learning.policies.networks import NetworkConfig
 
 
 class EpisodeEnv(Env):
@@ -75,21 +69,15 @@ class EpisodeEnv(Env):
 class SelectionEnv(EpisodeEnv):
     """Postures; arguments as of ``PosturesEnv``."""
 
-    def __init__(
-        self,
-        config: SelectionConfig | None = None,
-        draw: CandidateSource | None = None,
-        net: NetworkConfig | None = None,
-    ) -> None:
-        super().__init__(PosturesEnv(config, draw, net))
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(PosturesEnv(*arguments, **named))
 
 
 class _FreshReset(Wrapper):
     """After ``done``, a new episode from the key that the old one carried."""
 
     def step(self, state: State, action: jax.Array) -> State:
-        steps = jnp.where(state.done > 0, 0.0, state.info["steps"])
-        state.info.update(steps=steps)
+        state.info["steps"] = jnp.where(state.done > 0, 0.0, state.info["steps"])
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)
 
         def begin(key: jax.Array) -> tuple[Any, jax.Array]:
@@ -98,9 +86,7 @@ class _FreshReset(Wrapper):
 
         # Episodes of one length end together, so all steps but their last skip this.
         episode, obs = jax.vmap(functools.partial(renewed, begin))(
-            state.done > 0,
-            state.pipeline_state.key,
-            (state.pipeline_state, state.obs),
+            state.done > 0, state.pipeline_state.key, (state.pipeline_state, state.obs)
         )
         return state.replace(pipeline_state=episode, obs=obs)
 
@@ -152,12 +138,9 @@ def brax_networks(
 
     def read(part: int) -> FeedForwardNetwork:
         def apply(_: Any, params: Any, observation: jax.Array) -> Any:
-            answer: Any = module.apply(params, observation)
-            return answer[part]
+            return module.apply(params, observation)[part]
 
-        return FeedForwardNetwork(
-            init=lambda key: jax.jit(module.init)(key, blank), apply=apply
-        )
+        return FeedForwardNetwork(lambda key: jax.jit(module.init)(key, blank), apply)
 
     identity = distribution.IdentityPostprocessor()
     actions = _MaskedCategorical(

@@ -156,14 +156,13 @@ class PPOConfig(abc.ABC):
             if swept.count(name) > 1:
                 raise ValueError(f"sweep must have each name once, got {name} twice")
             if name not in TRACED:
-                names = ", ".join(TRACED)
-                raise ValueError(f"sweep must be of {names}, got {name}")
+                raise ValueError(f"sweep must be of {', '.join(TRACED)}, got {name}")
             for value in values:
-                changed: dict[str, Any] = {name: value}
-                dataclasses.replace(self, **changed)
+                dataclasses.replace(self, **{name: value})  # type: ignore[arg-type]
 
-    def require_whole(self, total: str, each: str) -> None:
+    def require_whole(self, budget: str, total: str, each: str) -> None:
         """Refuse a ``total`` that is not a multiple of ``each`` x num_minibatches."""
+        require(self, "at least 1", lambda v: v >= 1, budget, total, each)
         whole = getattr(self, each) * self.num_minibatches
         rule = f"a multiple of {each} x num_minibatches = {whole}"
         require(self, rule, lambda v: v % whole == 0, total)
@@ -211,9 +210,7 @@ class EpisodesConfig(PPOConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        counts = ("num_episodes", "episodes_per_update", "episodes_per_set")
-        require(self, "at least 1", lambda v: v >= 1, *counts)
-        self.require_whole("episodes_per_update", "episodes_per_set")
+        self.require_whole("num_episodes", "episodes_per_update", "episodes_per_set")
         if self.explore_once and self.episodes_per_set < 2:
             raise ValueError(
                 "episodes_per_set must be at least 2 with explore_once, got "
@@ -241,9 +238,7 @@ class StreamsConfig(PPOConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        counts = ("num_updates", "decisions_per_update", "stream_length")
-        require(self, "at least 1", lambda v: v >= 1, *counts)
-        self.require_whole("decisions_per_update", "stream_length")
+        self.require_whole("num_updates", "decisions_per_update", "stream_length")
 
     @property
     def rows_per_update(self) -> int:

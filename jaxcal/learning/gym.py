@@ -1,11 +1,5 @@
 """Postures under Gymnasium's interfaces; importing this registers them.
 
-    import gymnasium
-    import jaxcal.learning.gym
-
-    env = gymnasium.make("jaxcal/Postures-v0", num_candidates=50)
-    envs = gymnasium.make_vec("jaxcal/Postures-v0", num_envs=256, num_candidates=50)
-
 The environments of a batch are one JAX program. Observations, rewards and ends are
 numpy arrays; ``infos["action_mask"]`` says what may be chosen next, of one environment
 ``action_masks()`` too, as sb3-contrib asks for it.
@@ -152,10 +146,8 @@ class JaxVector(VectorEnv):
         after, reward, done, metric = self._env.advance(state, action)
         last = self._seen(after)
         if not self._same_step:  # where the episode was over, this begins one
-            reward, metric, done = (
-                jnp.where(ended, 0, x) for x in (reward, metric, done)
-            )
-            done = done.astype(bool)
+            reward, metric = (jnp.where(ended, 0.0, x) for x in (reward, metric))
+            done = done & ~ended
         begins = done if self._same_step else ended
         state = renewed(self._env.begin, begins, after.key, after)
         return state, self._seen(state), last, reward, done, metric
@@ -163,9 +155,8 @@ class JaxVector(VectorEnv):
 
 def _postures(sizes: dict[str, Any]) -> PosturesEnv:
     fields = [field.name for field in dataclasses.fields(SelectionConfig)]
-    for name in sizes:
-        if name not in fields:
-            raise ValueError(f"options must be of {', '.join(fields)}, got {name}")
+    for name in set(sizes).difference(fields):
+        raise ValueError(f"options must be of {', '.join(fields)}, got {name}")
     return PosturesEnv(SelectionConfig(**sizes))
 
 

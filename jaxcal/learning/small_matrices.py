@@ -1,8 +1,7 @@
 """Determinants and factors of small matrices, written out entry by entry in JAX.
 
-No library factorisation is used: for matrices of 3 to 5 rows unrolled arithmetic is
-faster on a batch, the same on every backend, and has a gradient. All functions
-broadcast over leading axes.
+For matrices of 3 to 5 rows unrolled arithmetic is faster on a batch than a library's
+factorisation, and the same on every backend. All broadcast over leading axes.
 """
 
 from __future__ import annotations

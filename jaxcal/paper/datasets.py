@@ -112,7 +112,7 @@ def chunks(
 
 
 def _joined(parts: list[Dataset]) -> Dataset:
-    arrays = {
+    arrays: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in ("candidates", "measured")
         if getattr(parts[0], name) is not None
@@ -177,9 +177,7 @@ def recorded_dataset(
     return Dataset(name, unit, measured[rows], None, ranges, seed, digest)
 
 
-def read_pool(
-    path: str | os.PathLike[str],
-) -> tuple[Array, Array, JointRanges, str]:
+def read_pool(path: str | os.PathLike[str]) -> tuple[Array, Array, JointRanges, str]:
     """A recording in the order in which it was made.
 
     Returns:

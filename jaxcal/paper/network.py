@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning.core.network import Network, mask_logits
+from jaxcal.learning.core.network import Network, Scores, mask_logits
 from jaxcal.learning.environments.selection import context_features
 from jaxcal.learning.policies.networks import NetworkConfig
 
@@ -64,7 +64,7 @@ class Observing(Network):
 
     def from_observation(
         self, observation: jax.Array, num_candidates: int, num_inputs: int
-    ) -> tuple[jax.Array, jax.Array]:
+    ) -> Scores:
         """Logits and value from the (..., 210) numbers of ``selection.observe``."""
         m, n = num_candidates, num_inputs
         poses = observation[..., : n * m].reshape(*observation.shape[:-1], m, n)
@@ -101,9 +101,7 @@ class PaperNetwork(Observing):
         poses = nn.relu(self.pose_1(2.0 * features - 1.0))
         return self.pose_norm(nn.relu(self.pose_2(poses)))
 
-    def decode(
-        self, memory: jax.Array, decision: Decision
-    ) -> tuple[jax.Array, jax.Array]:
+    def decode(self, memory: jax.Array, decision: Decision) -> Scores:
         context = nn.relu(self.context_1(decision.context))
         context = self.context_norm(nn.relu(self.context_2(context)))
         scale = self.config.width**-0.5

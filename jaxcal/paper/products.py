@@ -1,10 +1,9 @@
 """Products of learned features of the paper's 210 numbers; the kind ``observation``.
 
-Nothing here computes a gain, a projection or a determinant. A determinant is linear in
-each of its rows: sums of products of learned features can hold it. The chosen postures
-are read one after another, ``h <- W (U h * V x)``, every candidate in the same way, and
-candidates attend to one another by a power of a learned bilinear score. docs/policy.md
-says what each part brings.
+Nothing here computes a gain, a projection or a determinant; sums of products of learned
+features can hold one, since it is linear in each of its rows. The chosen postures are
+read one after another, ``h <- W (U h * V x)``, and candidates attend to one another by
+a power of a learned bilinear score. docs/policy.md says what each part brings.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcal.learning.core.network import mask_logits
+from jaxcal.learning.core.network import Scores, mask_logits
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.paper.network import Decision, Observing
 
@@ -56,10 +55,8 @@ class ProductNetwork(Observing):
         x = (features - 0.5) * _SCALE
         return jnp.concatenate([x, jnp.ones_like(x[..., :1])], -1)
 
-    def decode(
-        self, memory: jax.Array, decision: Decision
-    ) -> tuple[jax.Array, jax.Array]:
-        """Score the next choice: (..., M) masked logits and (...,) value.
+    def decode(self, memory: jax.Array, decision: Decision) -> Scores:
+        """Scores of the next choice.
 
         ``mirrored``: the network chooses from each of the 2^n mirror images of the set,
         from the beginning; what most of them chose alike has the largest logits. Where

@@ -17,7 +17,8 @@ import pytest
 
 from jaxcal.commands import evaluate as command
 from jaxcal.commands import tables
-from jaxcal.evaluation import figures, stream
+from jaxcal.evaluation import figures
+from jaxcal.evaluation import methods as stream
 from jaxcal.evaluation.dataset import Dataset, save_csv, save_npz
 from jaxcal.information.regression import regression_matrix
 from jaxcal.paper.datasets import make_dataset

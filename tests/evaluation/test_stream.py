@@ -12,13 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxcal.evaluation import stream
+from jaxcal.evaluation import methods as stream
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.methods import evaluate
+from jaxcal.evaluation.methods import evaluate, evaluate_stream
 from jaxcal.evaluation.postures import summary_of
-from jaxcal.evaluation.report import json_document, text_table
-from jaxcal.evaluation.results import MethodNumbers, Summary
-from jaxcal.evaluation.stream import evaluate_stream
+from jaxcal.evaluation.report import MethodNumbers, Summary, json_document, text_table
 from jaxcal.information.regression import log_det_information
 from jaxcal.paper.datasets import drawn, make_dataset
 

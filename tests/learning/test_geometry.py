@@ -9,7 +9,7 @@ import pytest
 
 from jaxcal.information import regression
 from jaxcal.learning import small_matrices
-from jaxcal.learning.policies import geometry
+from jaxcal.learning.policies import features as geometry
 from jaxcal.selection.policy.policy_kernel import look_ahead
 
 # One program for every depth; op by op it would be many.

@@ -17,7 +17,7 @@ from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.networks import NetworkConfig, build
-from jaxcal.learning.training import imitation
+from jaxcal.learning.training import postures as imitation
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.run import updates

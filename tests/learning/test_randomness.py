@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxcal.learning.environments import randomness
+from jaxcal.learning.environments import selection as randomness
 
 # One program each: op by op a draw would be hundreds.
 uniform = jax.jit(randomness.uniform, static_argnums=1)

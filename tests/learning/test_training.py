@@ -554,7 +554,9 @@ def test_brax_saves_what_it_used_and_keeps_what_is_asked_for():
 def test_help_says_what_every_number_is(capsys):
     assert train("--help", "all") == 0
     text = capsys.readouterr().out
-    for name in presets.field_names() - {"num_episodes", "num_seeds"} | {"sweep"}:
+    parts = map(presets.settings_of, presets.PARTS.values())
+    names = {field.name for fields in parts for field in fields}
+    for name in names - {"num_episodes", "num_seeds"} | {"sweep"}:
         assert f"--{name.replace('_', '-')}" in text
     assert "what to try first" in text
     assert "passes over the decisions of an update [2]" in " ".join(text.split())

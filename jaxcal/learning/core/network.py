@@ -1,15 +1,9 @@
 """Interface of a network that chooses postures.
 
 Features, which need no parameters, are separate from ``encode`` and ``decode``, so that
-training computes them once for a decision and not in every epoch:
-
-    features      = candidate_features(candidates, usable)        of a set
-    decision      = decision_features(features, chosen, available, count)
-    memory        = encode(features)                              once for a set
-    logits, value = decode(memory, decision)                      once for a decision
-
-``value`` is the expected final log det(Z.T Z), unscaled. M candidates of n inputs, K
-choices; leading axes ``...``.
+training computes them once for a decision and not in every epoch. ``value`` is the
+expected final log det(Z.T Z), unscaled. M candidates of n inputs, K choices; leading
+axes ``...``.
 """
 
 from __future__ import annotations
@@ -20,6 +14,9 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+
+Scores = tuple[jax.Array, jax.Array]
+"""(..., M) masked logits and (...,) value."""
 
 
 class Network(nn.Module):
@@ -61,17 +58,16 @@ class Network(nn.Module):
         """(..., M, width) memory of a set."""
         raise NotImplementedError
 
-    def decode(self, memory: jax.Array, decision: Any) -> tuple[jax.Array, jax.Array]:
-        """(..., M) logits, masked, and (...,) value."""
+    def decode(self, memory: jax.Array, decision: Any) -> Scores:
         raise NotImplementedError
 
-    def lookahead_logits(self, decision: Any) -> tuple[jax.Array, jax.Array]:
+    def lookahead_logits(self, decision: Any) -> Scores:
         """Logits as of ``decode``, for one of the last ``num_unlearned`` choices."""
         raise NotImplementedError
 
     def __call__(
         self, candidates: jax.Array, available: jax.Array, chosen: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    ) -> Scores:
         """Logits and value of the first decision; flax initialises with this call."""
         features = self.candidate_features(candidates, available)
         decision = self.decision_features(features, chosen, available, 0)

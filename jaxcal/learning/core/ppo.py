@@ -1,10 +1,5 @@
 """Proximal policy optimisation: loss, advantages, optimiser, update, training.
 
-    train = make_train(config)
-    state, metrics = jax.jit(train)(jax.random.key(0))  # state.average: the policy
-    jax.vmap(train)(jax.random.split(jax.random.key(0), 8))  # eight runs, one program
-    jax.vmap(lambda rate: train(key, learning_rate=rate))(rates)  # as many rates
-
 A ``Learner`` plays and scores: ``postures`` has that of episodes of a fixed number of
 choices, ``streams`` that of sessions of any length. Everything here is pure;
 ``training.run`` adds files, progress and a host.
@@ -355,14 +350,12 @@ def make_update(
             jax.lax.cond(fine, lambda: state, lambda: before),
             key=jax.random.key_data(key),
             num_updates=before.num_updates + 1,
-            rollout_state=rollout_state,
+            rollout_state=(),
         )
-        rollout_state = placed(after.rollout_state, mesh, "sets")
         skipped = jnp.where(fine, 0.0, 1.0)
         metrics = played | losses | {"learning_rate": rate, "skipped": skipped}
-        after, metrics = placed(
-            (dataclasses.replace(after, rollout_state=()), metrics), mesh
-        )
+        after, metrics = placed((after, metrics), mesh)
+        rollout_state = placed(rollout_state, mesh, "sets")
         return dataclasses.replace(after, rollout_state=rollout_state), metrics
 
     return update

@@ -1,13 +1,10 @@
 """Streams: sessions of any length played one after another, as experience for PPO.
 
-An update plays T further decisions of B streams, however long the sessions in them are.
-Where a stream is cut, the next update goes on; the value of that state closes the
-advantages. The value after a decision is the expectation over its possible outcomes,
-not the value of the outcome that was drawn: the advantages have the same expectation
-without the randomness of outcomes, which is most of their variance.
-
-The task is an argument of the environment's functions, as arrays: another task of the
-same shapes compiles nothing.
+An update plays T further decisions of B streams. Where a stream is cut, the next update
+goes on; the value of that state closes the advantages. The value after a decision is
+the expectation over its possible outcomes, not that of the outcome drawn: the
+advantages have the same expectation without most of their variance. The task is an
+argument, as arrays: another one of the same shapes compiles nothing.
 """
 
 from __future__ import annotations

@@ -1,15 +1,8 @@
 """Episodes for loops of one's own: the interface of gymnax 1.x.
 
-    env = PosturesEnv()
-    obs, state = jax.vmap(env.reset)(keys)
-    obs, state, reward, terminated, truncated, info = jax.vmap(env.step)(
-        keys, state, actions
-    )
-
 A step that ends an episode returns the first observation of a fresh one, drawn only
 where one of the batch has ended; ``info["action_mask"]`` says what may be chosen next.
-brax and Gymnasium see the same episodes through ``learning.brax`` and
-``learning.gym``.
+brax and Gymnasium see the same episodes through ``learning.brax`` and ``learning.gym``.
 """
 
 from __future__ import annotations
@@ -129,12 +122,14 @@ class FunctionalEnv(abc.ABC):
         key = jax.random.key(0)
         return jax.eval_shape(lambda key: function(self.begin(key)), key)
 
-    @functools.partial(jax.jit, static_argnames="self")
-    def reset(
+    def reset_env(
         self, key: jax.Array, params: EnvParams | None = None
     ) -> tuple[jax.Array, Any]:
         """Observation and state of a new episode."""
-        return self.reset_env(key, params)
+        state = self.begin(key)
+        return self.observation(state), state
+
+    reset = functools.partial(jax.jit, static_argnames="self")(reset_env)
 
     @functools.partial(jax.jit, static_argnames="self")
     def step(
@@ -173,12 +168,6 @@ class FunctionalEnv(abc.ABC):
     @property
     def default_params(self) -> EnvParams:
         return EnvParams(self.longest)
-
-    def reset_env(
-        self, key: jax.Array, params: EnvParams | None = None
-    ) -> tuple[jax.Array, Any]:
-        state = self.begin(key)
-        return self.observation(state), state
 
     def step_env(
         self,
@@ -265,12 +254,10 @@ class PosturesEnv(FunctionalEnv):
         return selection.observe(state, self.config)
 
     def available(self, state: Any) -> jax.Array:
-        mask: jax.Array = state.available
-        return mask
+        return state.available
 
     def steps(self, state: Any) -> jax.Array:
-        count: jax.Array = state.count
-        return count
+        return state.count
 
     @property
     def longest(self) -> int:

@@ -1,8 +1,7 @@
 """Where training candidates come from: shapes and masks, a pool, given sets.
 
-Each function returns a ``CandidateSource``: key -> (M, n) candidates and (M,)
-available. The compact network is invariant to affine maps, so ``mixture`` varies no
-ranges, shear or correlation, only the shape of the cloud and what is masked.
+Each function returns a ``CandidateSource``. The compact network is invariant to affine
+maps, so ``mixture`` varies only the shape of the cloud and what is masked.
 """
 
 from __future__ import annotations
@@ -16,8 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.learning.config import SHAPES
-from jaxcal.learning.environments import randomness
-from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
+from jaxcal.learning.environments.selection import (
+    CandidateSource,
+    SelectionConfig,
+    uniform,
+)
 
 __all__ = ["SHAPES", "given", "mixture"]
 
@@ -57,7 +59,7 @@ def given(
 
 def _shape(name: str, key: jax.Array, m: int, n: int) -> jax.Array:
     if name == "uniform":
-        return randomness.uniform(key, (m, n))
+        return uniform(key, (m, n))
     if name == "gaussian":
         return jax.random.normal(key, (m, n))
     key_a, key_b, key_c = jax.random.split(key, 3)

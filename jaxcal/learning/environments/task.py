@@ -1,7 +1,6 @@
 """Task of a training: the selection environment and where its candidates come from.
 
-``Task`` implements ``core.postures.Episode``, which PPO plays. Another environment is
-another class with these methods. JAX is loaded when one is played.
+JAX is loaded when one is played.
 """
 
 from __future__ import annotations

@@ -8,8 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning.core.network import Network, mask_logits
-from jaxcal.learning.policies import geometry
+from jaxcal.learning.core.network import Network, Scores, mask_logits
 from jaxcal.learning.policies.features import (
     CandidateFeatures,
     DecisionFeatures,
@@ -17,6 +16,7 @@ from jaxcal.learning.policies.features import (
     close_up_of,
     decision_features,
     vector_features,
+    whiten,
 )
 from jaxcal.learning.policies.networks import NetworkConfig
 
@@ -113,7 +113,7 @@ class CompactNetwork(Network):
     def candidate_features(
         self, candidates: jax.Array, usable: jax.Array
     ) -> CandidateFeatures:
-        whitened, offset = geometry.whiten(candidates, usable)
+        whitened, offset = whiten(candidates, usable)
         depth = min(self.config.lookahead, whitened.shape[-1])
         close_up = self.config.close_up
         vectors = vector_features(whitened, False, usable, depth, close_up)
@@ -143,10 +143,7 @@ class CompactNetwork(Network):
             h = layer(h, features.vectors)
         return h
 
-    def decode(
-        self, memory: jax.Array, decision: DecisionFeatures
-    ) -> tuple[jax.Array, jax.Array]:
-        """(..., M) masked logits and (...,) value, in units of log det(Z.T Z)."""
+    def decode(self, memory: jax.Array, decision: DecisionFeatures) -> Scores:
         h, vectors = memory, decision.vectors
         columns, active = vectors.columns, vectors.active
         mean = jnp.einsum("...m,...mw->...w", decision.chosen, h)
@@ -170,9 +167,7 @@ class CompactNetwork(Network):
         value = self.critic(nn.relu(self.critic_hidden(pooled)))[..., 0]
         return logits, decision.reached + value
 
-    def lookahead_logits(
-        self, decision: DecisionFeatures
-    ) -> tuple[jax.Array, jax.Array]:
+    def lookahead_logits(self, decision: DecisionFeatures) -> Scores:
         vectors = decision.vectors
         logits = mask_logits(_SHARP * vectors.to_the_end, vectors.active)
         return logits, decision.reached

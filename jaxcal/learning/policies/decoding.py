@@ -2,9 +2,8 @@
 
 Written once over a ``Scorer``: the network in JAX (``policies.scorer``) is one, the
 compact network in numpy (``jaxcal.selection.policy.compact``) another. Needs no JAX.
-
-Letters: B candidate sets, E episodes (a set and the choices made from it), M
-candidates, K choices in all, p regressors of a candidate.
+B candidate sets, E episodes (a set and the choices made from it), M candidates, K
+choices in all, p regressors of a candidate.
 """
 
 from __future__ import annotations

@@ -1,20 +1,30 @@
 """Inputs of the compact network: geometry of a candidate set and of a decision.
 
 Nothing here has parameters, so training computes it once for a decision and not in
-every epoch. Shapes: M candidates, n inputs, p = n + 1, K choices; leading axes ``...``.
+every epoch. The best subset does not change under an affine map of the commands, so
+the policy works on whitened regressors ``x_i`` (mean over the candidates of ``x x.T``
+is the identity). A choice is a projection: its direction is removed from every
+remaining ``x_i``, whose squared length is then the gain of choosing it.
+
+Shapes: M candidates, n inputs, p = n + 1, K choices; leading axes ``...``.
 """
 
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcal.learning.policies import geometry
+from jaxcal.learning.small_matrices import cholesky, solve_lower
 
+_LOWEST = -30.0  # log-volume of a candidate that is not active
+ALL_START = 1024  # M up to which all are looked ahead from
+STARTS = 512  # of more, those of largest gain that are
+_TAKEN = -1e9  # gain of a candidate that cannot be chosen
+_LEAST_GAIN = 1e-5  # of whitened vectors; smaller gains are float32 rounding errors
 _FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
 _RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
 _CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ
@@ -100,12 +110,12 @@ def decision_features(
     else:
         if total == p:
             # Every choice is a new direction: exact projections.
-            y, so_far = geometry.projected(x, picked, count)
+            y, so_far = projected(x, picked, count)
         else:
             # The metric of the chosen; until they span the space, with a ridge small
             # beside what a posture contributes.
             ridge = jnp.where(count < p, _RIDGE, 0.0)
-            y, so_far = geometry.normalised_by(x, picked, ridge)
+            y, so_far = normalised_by(x, picked, ridge)
         depth = jnp.minimum(lookahead, total - count)
         vectors = vector_features(y, total != p, available, depth, close_up)
     remaining = total - count
@@ -132,14 +142,14 @@ def vector_features(
     depth: jax.typing.ArrayLike,
     close_up: bool,
 ) -> VectorFeatures:
-    """Features of vectors y (..., M, p); arguments as in ``geometry.lookahead``."""
+    """Features of vectors y (..., M, p); arguments as in ``lookahead``."""
     y = y * active[..., None].astype(y.dtype)
     number = jnp.maximum(active.sum(-1).astype(y.dtype), 1.0)
     square = (y * y).sum(-1)
     mean_square = jnp.maximum(square.sum(-1) / number, 1e-8)
     unit = y * jax.lax.rsqrt(mean_square)[..., None, None]
     moments = _second_moments(unit) * jax.lax.rsqrt(number)[..., None, None]
-    ahead = jnp.stack(geometry.lookahead(y, spanned, active, depth), axis=-1)
+    ahead = jnp.stack(lookahead(y, spanned, active, depth), axis=-1)
     best = ahead.max(-2)
     ahead = jnp.maximum(ahead - best[..., None, :], -30.0)
     level = jnp.log(jnp.maximum(square, 1e-6) / mean_square[..., None])
@@ -167,3 +177,173 @@ def _second_moments(x: jax.Array) -> jax.Array:
     scale = np.where(first == second, 1.0, 2.0**0.5).astype(x.dtype)
     picked = functools.partial(jnp.matmul, x, precision=jax.lax.Precision.HIGHEST)
     return picked(eye[:, first]) * picked(eye[:, second] * scale)
+
+
+def whiten(candidates: jax.Array, usable: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Whitened regressors of candidates (..., M, n), of which ``usable`` (..., M)
+    count.
+
+    Returns:
+        (..., M, n + 1) vectors x with mean ``x x.T = I`` over the usable candidates,
+        zero elsewhere, and (...,) the log-determinant of ``Z_s.T Z_s`` of a subset less
+        that of ``X_s.T X_s``.
+    """
+    weight = usable.astype(candidates.dtype)
+    number = jnp.maximum(weight.sum(-1), 1.0)
+    mean = (weight[..., None] * candidates).sum(-2, keepdims=True)
+    centred = (candidates - mean / number[..., None, None]) * weight[..., None]
+    covariance = jnp.einsum(
+        "...mi,...mj->...ij", centred, centred, precision=jax.lax.Precision.HIGHEST
+    )
+    lower = cholesky(covariance / number[..., None, None])
+    white = solve_lower(lower, centred)
+    offset = 2.0 * jnp.log(jnp.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
+    return jnp.concatenate([white, weight[..., None]], axis=-1), offset
+
+
+def projected(
+    x: jax.Array, chosen: jax.Array, count: jax.typing.ArrayLike
+) -> tuple[jax.Array, jax.Array]:
+    """Components of every vector x (..., M, p) orthogonal to the chosen ones.
+
+    Of ``chosen`` (..., c, p), c <= p, the first ``count`` are chosen so far, the others
+    zero. One in the span of those before it is not projected out again.
+
+    Returns:
+        (..., M, p), whose squared lengths are the Schur-complement gains; and (...,)
+        the log of the squared volume that the chosen span, 0 where nothing is chosen.
+    """
+    eye = jnp.eye(x.shape[-1], dtype=x.dtype)
+
+    def project(carry: Any, now: Any) -> tuple[Any, None]:
+        projection, volume = carry  # (..., p, p) on what the chosen leave
+        vector, number = now
+        rest = (projection * vector[..., None, :]).sum(-1)
+        square = (rest * rest).sum(-1)
+        grown = jnp.log(jnp.maximum(square, 1e-9))
+        volume = volume + jnp.where(number < jnp.asarray(count), grown, 0.0)
+        independent = square > 1e-9 * (vector * vector).sum(-1)
+        factor = jnp.where(independent, 1.0 / jnp.where(independent, square, 1.0), 0.0)
+        along = rest[..., :, None] * rest[..., None, :]
+        return (projection - factor[..., None, None] * along, volume), None
+
+    start = (
+        jnp.broadcast_to(eye, (*chosen.shape[:-2], *eye.shape)),
+        jnp.zeros(chosen.shape[:-2], chosen.dtype),
+    )
+    vectors = jnp.moveaxis(chosen, -2, 0), jnp.arange(chosen.shape[-2])
+    # A loop: written out it takes three times as long to compile.
+    (projection, volume), _ = jax.lax.scan(project, start, vectors)
+    return jnp.einsum("...mp,...pq->...mq", x, projection), volume
+
+
+def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
+    total = a[0] * b[0]
+    for left, right in zip(a[1:], b[1:], strict=True):
+        total = total + left * right
+    return total
+
+
+def normalised_by(
+    x: jax.Array, chosen: jax.Array, ridge: jax.typing.ArrayLike
+) -> tuple[jax.Array, jax.Array]:
+    """Every vector x (..., M, p) in the metric of the ``chosen`` (..., c, p).
+
+    ``|y_i|^2 = x_i.T G^-1 x_i``, ``G = C.T C + ridge I``; a ridge of 0 needs vectors
+    that span the space, zeros among them count nothing.
+
+    Returns:
+        (..., M, p) vectors y: choosing i multiplies det G by ``1 + |y_i|^2``; and
+        (...,) log det G.
+    """
+    p = x.shape[-1]
+    gram = jnp.einsum(
+        "...ci,...cj->...ij", chosen, chosen, precision=jax.lax.Precision.HIGHEST
+    )
+    gram = jnp.broadcast_to(gram, (*x.shape[:-2], p, p))
+    eye = jnp.eye(p, dtype=x.dtype)
+    least = jnp.maximum(jnp.asarray(ridge, x.dtype), 1e-6)
+    lower = cholesky(gram + least * jnp.broadcast_to(eye, gram.shape))
+    log_det = 2.0 * jnp.log(jnp.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
+    return solve_lower(lower, x), log_det
+
+
+def lookahead(
+    y: jax.Array, spanned: bool, active: jax.Array, depth: jax.typing.ArrayLike
+) -> list[jax.Array]:
+    """Log gain of the determinant from each candidate and greedy choices after it.
+
+    Args:
+        y: (..., M, p) conditional vectors (``projected`` or ``normalised_by``), zero
+            where not active.
+        spanned: True where choosing i multiplies the determinant by ``1 + |y_i|^2``,
+            False where by ``|y_i|^2``.
+        active: (..., M) bool.
+        depth: () number of choices, that candidate included; at least 1.
+
+    Returns:
+        Four arrays (..., M): the log of the factor by which the determinant grows over
+        the first 1, 2, 3 and ``depth`` choices, all of them where there are fewer; -30
+        where not active. The first is the gain. The second is the gain of the best
+        pair, exactly; later ones are what greedy choices reach. Cost: ``depth - 1``
+        products of (M, p) with (p, M). Of more than 1,024 candidates only the 512 of
+        largest gain are looked ahead from, as in
+        ``selection/policy/policy_kernel.py``: of the others all but the first are -30.
+    """
+    m, p = y.shape[-2:]
+    base = 1.0 if spanned else 0.0
+    square = (y * y).sum(-1)
+    gain = jnp.log(jnp.maximum(base + square, _LEAST_GAIN))
+    first = jnp.where(active, gain, _LOWEST)
+    # For every start i (axis -2): the gains of all j (axis -1) after its choices.
+    starts = jnp.broadcast_to(jnp.arange(m), square.shape)
+    picked, reached, begins = y, first, active  # of each start, its newest choice
+    if m > ALL_START:
+        starts = jax.lax.top_k(jnp.where(active, square, -1.0), STARTS)[1]
+        picked = jnp.take_along_axis(y, starts[..., None], axis=-2)
+        reached, begins = (
+            jnp.take_along_axis(x, starts, axis=-1) for x in (reached, begins)
+        )
+    shape = (*starts.shape, m)
+    column = jnp.broadcast_to(jnp.arange(m), shape)
+    gains = jnp.where(active, square, _TAKEN)[..., None, :]
+    eye = jnp.broadcast_to(jnp.eye(p, dtype=y.dtype), (*starts.shape, p, p))
+    parts = [y[..., None, :, i] for i in range(p)]
+
+    def further(d: jax.Array, carry: Any) -> Any:
+        """One more greedy choice of every start; ``metric`` (..., S, p, p) turns inner
+        products into those of what its choices have left."""
+        gains, metric, picked, newest, values = carry
+        back = (metric * picked[..., None, :]).sum(-1)
+        size = jnp.maximum((back * picked).sum(-1), _LEAST_GAIN)
+        shrink = 1.0 / (base + size)
+        inner = _dot([back[..., i, None] for i in range(p)], parts)
+        gains = gains - inner * inner * shrink[..., None]
+        gains = jnp.where(column == newest[..., None], _TAKEN, gains)
+        along = back[..., :, None] * back[..., None, :]
+        metric = metric - shrink[..., None, None] * along
+        newest = jnp.argmax(gains, axis=-1).astype(newest.dtype)
+        grown = jnp.maximum(base + jnp.maximum(gains.max(-1), 0.0), _LEAST_GAIN)
+        reached = values[3] + jnp.log(grown)
+        ends = (d < 2, d < 3, jnp.array(True))  # the pair, the triple, the last
+        later = [
+            jnp.where(end, reached, value)
+            for end, value in zip(ends, values[1:], strict=True)
+        ]
+        picked = jnp.take_along_axis(y, newest[..., None], axis=-2)
+        return gains, metric, picked, newest, [values[0], *later]
+
+    carry = (jnp.broadcast_to(gains, shape), eye, picked, starts, [reached] * 4)
+    # A loop: as many copies of it as choices would take ten times as long to compile.
+    *_, values = jax.lax.fori_loop(1, depth, further, carry)
+    values = [jnp.where(begins, value, _LOWEST) for value in values[1:]]
+    if m > ALL_START:
+        lowest = jnp.full_like(square, _LOWEST)
+        some = jnp.asarray(depth) > 1
+        values = [
+            jnp.where(
+                some, jnp.put_along_axis(lowest, starts, x, -1, inplace=False), first
+            )
+            for x in values
+        ]
+    return [first, *values]

@@ -1,12 +1,9 @@
 """Configuration of a network of postures, and the kinds of network there are.
 
-``compact`` is part of this package. A network of one's own is a class, or its name:
-``module:Name`` or ``file.py:Name``; it is a ``core.network.Network``, which has this
-configuration if it has a field ``config``. An installed package adds a kind by an entry
-point, as jaxcal's own pyproject.toml adds ``paper``:
-
-    [project.entry-points."jaxcal.networks"]
-    paper = "jaxcal.paper.network:PaperNetwork"
+A network of one's own is a class, or its name: ``module:Name`` or ``file.py:Name``; it
+is a ``core.network.Network``, which has this configuration if it has a field
+``config``. An installed package adds a kind by an entry point in the group
+``jaxcal.networks``.
 """
 
 from __future__ import annotations
@@ -43,8 +40,7 @@ class NetworkConfig:
     )
     initial_actor: float = setting(0.1, "scale of the learned score at the start")
     mirrored: bool = setting(
-        False,
-        "for observation: choose by the mean over a set's mirror images",
+        False, "for observation: choose by the mean over a set's mirror images"
     )
 
     def __post_init__(self) -> None:

@@ -82,8 +82,7 @@ def scores_of(
         decision = network.decision_features(features, chosen, free, count)
         if not learned:
             return network.lookahead_logits(decision)[0]
-        logits: jax.Array = networks.decode(network, params, encoded, decision)[0]
-        return logits
+        return networks.decode(network, params, encoded, decision)[0]
 
     return jax.vmap(of_try, in_axes=1, out_axes=1)(chosen, free)
 

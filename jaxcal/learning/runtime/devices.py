@@ -1,9 +1,8 @@
 """One update over many devices: each plays some candidate sets and has all weights.
 
-The mesh has one axis, ``sets``. Keys are split for every set of the whole job before
-anything is placed, so an update draws the same numbers on one device and on many; only
-the order of sums differs. With several seeds the axis is ``seeds`` instead, and each
-device trains some of them. With one device there is no mesh and nothing is placed.
+Keys are split for every set of the whole job before anything is placed, so an update
+draws the same numbers on one device and on many; only the order of sums differs. With
+several seeds each device trains some of them. With one device there is no mesh.
 Process 0 alone reads and writes files; ``on_first`` sends what it read to the others.
 """
 

@@ -1,9 +1,9 @@
-"""A job of several processes: its members, and how a process joins and leaves.
+"""A job of several processes, which run the same command: how one joins and leaves.
 
-Every process runs the same command. It learns of the others from ``--coordinator``,
-``--num-processes`` and ``--process-id``, or from what JAX finds under SLURM, Open MPI,
-Kubernetes and on Cloud TPU. When a process dies, JAX ends the others after
-``HEARTBEAT_SECONDS``; checkpoints stay, and the next start resumes from the newest.
+It learns of the others from ``--coordinator``, ``--num-processes`` and
+``--process-id``, or from what JAX finds under SLURM, Open MPI, Kubernetes and on Cloud
+TPU. When a process dies, JAX ends the others after ``HEARTBEAT_SECONDS``; checkpoints
+stay.
 """
 
 from __future__ import annotations

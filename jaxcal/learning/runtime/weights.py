@@ -1,7 +1,7 @@
 """Paths of checkpoints, and a policy as one plain file; needs no JAX and no orbax.
 
 A weights file (``.npz``) holds the weights by flat name (``encoder_0.mix.kernel``) and
-``header``: JSON with the format, its version, the fields of the ``NetworkConfig``, the
+``header``: JSON with format, version, the fields of the ``NetworkConfig``, the
 checkpoint's meta and the SHA-256 of network and weights, by which damage is found.
 """
 

@@ -1,13 +1,10 @@
 """Checkpoints: of a run by orbax, of a finished policy as one plain file.
 
-A run's folder ``checkpoint`` holds one numbered folder per save. Each has ``policy``
-(the averaged weights), ``state`` (what else a resumed run needs) and ``meta`` (JSON:
-schema, configuration, package versions, progress). Orbax writes a step beside the
-others and renames it, so a kill during a save leaves the previous one. A policy alone
-is one weights file (``runtime.weights``): what ships, and what a rig reads.
-
-orbax calls this interface legacy and its successor is still experimental; it is used
-here alone, so that changing it touches one file.
+A run's folder ``checkpoint`` holds one numbered folder per save: ``policy`` (the
+averaged weights), ``state`` (what else a resumed run needs) and ``meta`` (JSON: schema,
+configuration, package versions, progress). Orbax writes a step beside the others and
+renames it, so a kill during a save leaves the previous one. orbax calls this interface
+legacy; it is used here alone.
 """
 
 from __future__ import annotations
@@ -35,17 +32,6 @@ from jaxcal.learning.core.ppo import TrainState
 from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import CheckpointError, Weights, locate
-
-__all__ = [
-    "SCHEMA",
-    "CheckpointError",
-    "Policy",
-    "load",
-    "read",
-    "read_meta",
-    "restore",
-    "save",
-]
 
 SCHEMA = "jaxcal-policy"
 VERSION = 2
@@ -265,11 +251,8 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
     if path.is_file():
         arrays = weights.read(path).arrays
         params = jax.tree.map(jax.numpy.asarray, unflatten_dict(arrays, sep="."))
-        held, wanted = (
-            (jax.tree.structure(tree), [leaf.shape for leaf in jax.tree.leaves(tree)])
-            for tree in (params, like)
-        )
-        if held != wanted:
+        wanted = flatten_dict(like, sep=".")
+        if jax.tree.map(np.shape, arrays) != jax.tree.map(lambda x: x.shape, wanted):
             raise CheckpointError(f"checkpoint {path} cannot be {what}")
     elif runs == 1:
         params = _read(path / "policy", like, what)

@@ -119,7 +119,6 @@ _GENERAL = TrainConfig(
 )
 
 _OWN = {config.preset: config for config in (_COMPACT, _GENERAL)}
-
 PARTS: dict[str, type] = {
     "run": TrainConfig,
     "ppo": EpisodesConfig,
@@ -138,13 +137,7 @@ def load(name: str) -> TrainConfig:
         return _OWN[name]
     if name not in names():
         raise ValueError(f"preset must be one of {', '.join(names())}, got {name!r}")
-    config: TrainConfig = installed(_GROUP)[name].load()
-    return config
-
-
-def field_names() -> set[str]:
-    """Every field that ``with_values`` can change."""
-    return {field.name for part in PARTS.values() for field in settings_of(part)}
+    return installed(_GROUP)[name].load()
 
 
 def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
@@ -154,7 +147,8 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     Where more than n + 1 postures are asked for, the reward becomes the increase of log
     det S (``reward_gain``), so that an episode is paid what it is judged by.
     """
-    for name in sorted(set(values) - field_names()):
+    fields = {field.name for part in PARTS.values() for field in settings_of(part)}
+    for name in sorted(set(values) - fields):
         raise ValueError(f"no configuration has the field {name}")
     network, ppo, run, changed = (
         {f.name: values[f.name] for f in settings_of(PARTS[part]) if f.name in values}
@@ -185,9 +179,8 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
 
 
 def _changed(task: Task, values: dict[str, Any]) -> Task:
-    environment = dataclasses.replace(task.environment, **values)
-    sized = {"num_selected", "num_inputs"} & set(values)
-    if sized and "reward_gain" not in values:
-        gain = environment.num_selected > environment.num_regressors
-        environment = dataclasses.replace(environment, reward_gain=gain)
-    return dataclasses.replace(task, environment=environment)
+    env = dataclasses.replace(task.environment, **values)
+    if {"num_selected", "num_inputs"} & set(values) and "reward_gain" not in values:
+        gain = env.num_selected > env.num_regressors
+        env = dataclasses.replace(env, reward_gain=gain)
+    return dataclasses.replace(task, environment=env)

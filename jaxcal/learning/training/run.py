@@ -1,10 +1,9 @@
 """The loop of a training run: files, resume, validation, progress, devices.
 
 A run folder holds ``metrics.csv`` (a row per update; means over runs side by side),
-``seeds.csv`` (of several: every validation of each), ``last_rewards.npy`` (the rewards
-of the last 1,000 episodes of the first task) and ``checkpoint/``. The loop is on the
-host, over calls of several updates each, so that progress is printed while it runs and
-a signal stops it between two calls.
+``seeds.csv`` (every validation of each of several), ``last_rewards.npy`` (the last
+1,000 rewards of the first task) and ``checkpoint/``. The loop is on the host, over
+calls of several updates, so that a signal stops it between two.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import os
 import pathlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TextIO
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -78,15 +77,13 @@ class Recipe:
             return _begun(ppo, learner, key, *self.given, **values)
 
         keys = jnp.stack([jax.random.key(run["seed"]) for run in self.runs])
-        swept = [name for name, _ in self.config.sweep]
         values = {
             name: jnp.array([run[name] for run in self.runs], jnp.float32)
-            for name in swept
+            for name, _ in self.config.sweep
         }
         if len(self.runs) == 1:
             return begin(keys[0], {name: value[0] for name, value in values.items()})
-        state: TrainState = jax.vmap(begin)(keys, values)
-        return state
+        return jax.vmap(begin)(keys, values)
 
 
 # One program for every seed; eager, it would compile two hundred small ones.
@@ -218,39 +215,38 @@ def run(
         state, before, recent = devices.on_first(lambda: _begin(root, recipe, resume))
         state = devices.replicate(state, mesh)
         done = int(np.max(devices.local(state.num_updates)))
-        with contextlib.ExitStack() as stack:
-            recorder = None
-            if devices.is_first():
-                recorder = _Recorder(root, recipe, report, last, before, done, recent)
-                stack.enter_context(contextlib.closing(recorder))
-            while done < last and not broken and not devices.any_process(should_stop()):
-                begun = time.perf_counter()
-                at_most, given = _UPDATES, recipe.given
-                learner = recipe.learners[done % len(recipe.learners)]
-                if done < recipe.num_imitated:
-                    assert recipe.imitate is not None  # there are updates that imitate
-                    learner, shown = recipe.imitate(done)
-                    at_most, given = 1, (devices.replicate(shown, mesh, "sets"),)
-                elif len(recipe.learners) > 1:
-                    at_most = 1  # the next update has another program
-                count = min(count, at_most, last - done)
-                update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
-                with collective():
-                    state, metrics = update(state, np.int32(count), *given)
-                    # One transfer for all that these updates measured.
-                    rows = jax.device_get(devices.local(metrics))
-                first, done = done, done + count
-                for number in range(count):
-                    fine = np.ravel(rows["skipped"][number]) == 0.0
-                    in_row = np.where(fine, 0, in_row + 1)
-                    if in_row.min() == _SKIPS:
-                        broken = _broken(rows, number, first + number + 1)
-                if recorder is not None:
-                    recorder.note(state, first, count, rows, save=not broken)
-                seconds = (time.perf_counter() - begun) / count
-                # The first call also compiled, so the second is of one update too.
-                fit = int(_CALL_SECONDS / seconds) if timed else 1
-                count, timed = devices.on_first(functools.partial(max, fit, 1)), True
+        recorder = None
+        if devices.is_first():
+            recorder = _Recorder(root, recipe, report, last, before, done, recent)
+            held.enter_context(contextlib.closing(recorder))
+        while done < last and not broken and not devices.any_process(should_stop()):
+            begun = time.perf_counter()
+            at_most, given = _UPDATES, recipe.given
+            learner = recipe.learners[done % len(recipe.learners)]
+            if done < recipe.num_imitated:
+                assert recipe.imitate is not None  # there are updates that imitate
+                learner, shown = recipe.imitate(done)
+                at_most, given = 1, (devices.replicate(shown, mesh, "sets"),)
+            elif len(recipe.learners) > 1:
+                at_most = 1  # the next update has another program
+            count = min(count, at_most, last - done)
+            update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
+            with collective():
+                state, metrics = update(state, np.int32(count), *given)
+                # One transfer for all that these updates measured.
+                rows = jax.device_get(devices.local(metrics))
+            first, done = done, done + count
+            for number in range(count):
+                fine = np.ravel(rows["skipped"][number]) == 0.0
+                in_row = np.where(fine, 0, in_row + 1)
+                if in_row.min() == _SKIPS:
+                    broken = _broken(rows, number, first + number + 1)
+            if recorder is not None:
+                recorder.note(state, first, count, rows, save=not broken)
+            seconds = (time.perf_counter() - begun) / count
+            # The first call also compiled, so the second is of one update too.
+            fit = int(_CALL_SECONDS / seconds) if timed else 1
+            count, timed = devices.on_first(functools.partial(max, fit, 1)), True
         if recorder is not None:
             recorder.save(state, done)
     if broken:
@@ -259,11 +255,9 @@ def run(
 
 
 def _broken(rows: Mapping[str, Any], number: int, update: int) -> str:
-    losses = ("policy_loss", "value_loss", *_LOSSES)  # what to name first
-    values = [
-        (name, float(np.mean(rows[name][number]))) for name in losses if name in rows
-    ]
-    name, value = next((n, v) for n, v in values if not np.isfinite(v))
+    names = [n for n in ("policy_loss", "value_loss", *_LOSSES) if n in rows]
+    values = {name: float(np.mean(rows[name][number])) for name in names}
+    name, value = next((n, v) for n, v in values.items() if not np.isfinite(v))
     return (
         f"diverged: {name} is {value} in {_SKIPS} consecutive updates, the last of "
         f"them {update}. The weights before are saved; start again with a smaller "
@@ -297,18 +291,15 @@ class _Recorder:
     def __post_init__(self) -> None:
         recipe = self.recipe
         first = ("update", recipe.config.ppo.unit, "seconds", "reward_mean")
-        self._columns = (*first, *recipe.columns, *_LOSSES, *recipe.measured)
-        self._rows = _table(self.root / "metrics.csv", self.reported, self._columns)
-        self._seeds: TextIO | None = None
-        self._seed_columns = ("update", *recipe.runs[0], *recipe.measured)
+        columns = (*first, *recipe.columns, *_LOSSES, *recipe.measured)
+        self._rows = _Table(self.root / "metrics.csv", self.reported, columns)
+        self._seeds: _Table | None = None
         if len(recipe.runs) > 1:
-            path = self.root / "seeds.csv"
-            self._seeds = _table(path, self.reported, self._seed_columns)
-        self._begun = self._validated = time.perf_counter()
-        self._noted, self._saved = self._begun, -np.inf  # soon after the beginning too
-        self._of_seeds: list[
-            dict[str, float]
-        ] = []  # of every seed, at the last validation
+            columns = ("update", *recipe.runs[0], *recipe.measured)
+            self._seeds = _Table(self.root / "seeds.csv", self.reported, columns)
+        self._begun = self._validated = self._noted = time.perf_counter()
+        self._saved = -np.inf  # soon after the beginning too
+        self._of_seeds: list[dict[str, float]] = []  # of the last validation
         self._skipped, self._judged = 0, 0
         self._judging_s = 0.0  # the last validation, the first apart: it compiles
 
@@ -330,17 +321,12 @@ class _Recorder:
             at = self._noted + (now - self._noted) * (number + 1) / count
             done = first + number + 1
             self._skipped += bool(np.any(metrics["skipped"][number]))
-            row: dict[str, float] = {
-                name: _mean(values[number]) for name, values in metrics.items()
-            }
-            row |= {
-                "update": done,
-                config.ppo.unit: done * config.ppo.played_per_update,
-                "seconds": self._seconds(at),
-            }
+            row = {name: _mean(values[number]) for name, values in metrics.items()}
+            row |= {"update": done, "seconds": self._seconds(at)}
+            row[config.ppo.unit] = done * config.ppo.played_per_update
             if number == count - 1:
                 self._validate(state, row)
-            _add(self._rows, self._columns, row)
+            self._rows.add(row)
         self._noted = now
         if save and now - self._saved > config.save_every:
             self._saved = now
@@ -358,21 +344,21 @@ class _Recorder:
             return
         spread: dict[str, float] = {}
         if recipe.validate is not None:
-            average = devices.local(state.average)
-            of_each = [average]
-            if (number := len(recipe.runs)) > 1:
-                of_each = [
-                    jax.tree.map(lambda x, i=i: x[i], average) for i in range(number)
+            average, several = devices.local(state.average), self._seeds is not None
+            policies = [average]
+            if several:
+                policies = [
+                    jax.tree.map(lambda x, i=i: x[i], average)
+                    for i in range(len(recipe.runs))
                 ]
-            self._of_seeds = [recipe.validate(average) for average in of_each]
+            self._of_seeds = [recipe.validate(policy) for policy in policies]
             for name in self._of_seeds[0]:
                 values = [seed[name] for seed in self._of_seeds]
                 row[name] = float(np.mean(values))
-                spread[name] = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+                spread[name] = float(np.std(values, ddof=1)) if several else 0.0
             if self._seeds is not None:
                 for run, measured in zip(recipe.runs, self._of_seeds, strict=True):
-                    validation = {"update": done} | run | measured
-                    _add(self._seeds, self._seed_columns, validation)
+                    self._seeds.add({"update": done} | run | measured)
         rate = (done - self.reported) / max(now - self._validated, 1e-9)
         self._validated, self.reported = time.perf_counter(), done
         if self._judged:
@@ -413,10 +399,8 @@ class _Recorder:
         checkpoint.save(self.root / "checkpoint", done, state.average, meta, state)
 
     def close(self) -> None:
-        for file in filter(None, (self._rows, self._seeds)):
-            file.flush()
-            os.fsync(file.fileno())
-            file.close()
+        for table in filter(None, (self._rows, self._seeds)):
+            table.close()
 
 
 def _begin(
@@ -438,20 +422,24 @@ def _mean(values: Any) -> float:
     return float(finite.mean()) if len(finite) else np.nan
 
 
-def _table(path: pathlib.Path, done: int, columns: Sequence[str]) -> TextIO:
-    """A CSV file opened to append, without rows of updates after ``done``."""
-    lines = path.read_text().splitlines()[1:] if path.exists() else []
-    commas = len(columns) - 1
-    whole = [(x.partition(",")[0], x) for x in lines if x.count(",") == commas]
-    kept = [x for first, x in whole if first.isdigit() and int(first) <= done]
-    write_text(path, "\n".join([",".join(columns), *kept]) + "\n")
-    return path.open("a", newline="")
+class _Table:
+    """A CSV file to append to, without its rows of updates after ``done``."""
 
+    def __init__(self, path: pathlib.Path, done: int, columns: Sequence[str]) -> None:
+        lines = path.read_text().splitlines()[1:] if path.exists() else []
+        commas = len(columns) - 1
+        whole = [(x.partition(",")[0], x) for x in lines if x.count(",") == commas]
+        kept = [x for first, x in whole if first.isdigit() and int(first) <= done]
+        write_text(path, "\n".join([",".join(columns), *kept]) + "\n")
+        self._columns, self._file = columns, path.open("a", newline="")
 
-def _add(file: TextIO, columns: Sequence[str], row: Mapping[str, float]) -> None:
-    """Write a row and flush it; what is not measured, or NaN, is empty."""
-    held = {name: value for name, value in row.items() if not np.isnan(value)}
-    csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n").writerow(
-        held
-    )
-    file.flush()
+    def add(self, row: Mapping[str, float]) -> None:
+        """Write a row and flush it; what is not measured, or NaN, is empty."""
+        cells = (row.get(name, np.nan) for name in self._columns)
+        writer = csv.writer(self._file, lineterminator="\n")
+        writer.writerow("" if np.isnan(cell) else cell for cell in cells)
+        self._file.flush()
+
+    def close(self) -> None:
+        os.fsync(self._file.fileno())
+        self._file.close()
