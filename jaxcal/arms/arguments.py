@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.arm import Load
 from jaxcal.arms.sensors import SENSORS, Position, Sensor
@@ -96,8 +97,6 @@ def transform(argument: str, given: ArrayLike | None) -> Array:
 
 def pose_matrix(pose: Array) -> Array:
     """(4, 4) of x, y, z and then turns about x, y, z in degrees (6,)."""
-    from scipy.spatial.transform import Rotation
-
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_euler("XYZ", pose[3:], degrees=True).as_matrix()
     matrix[:3, 3] = pose[:3]

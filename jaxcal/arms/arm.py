@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.chain_kernel import forward
 from jaxcal.arms.sensors import Reading, Sensor, Tip
@@ -68,10 +69,9 @@ class Arm:
 
     @functools.cached_property
     def length(self) -> float:
-        """Length of the links and the tool together; 0 where the table holds none.
+        """Length of the links and the tool; 0 where the table holds none.
 
-        Lengths along parallel axes that cancel, as in a table of Universal Robots' own
-        calibration, are counted together.
+        Lengths along parallel axes that cancel are counted together.
         """
         return apparent_length(self.table, self.tool)[0]
 
@@ -92,17 +92,10 @@ class Arm:
         )
 
     def rotation_vectors(self, commands: ArrayLike, rotations: ArrayLike) -> Array:
-        """Measured orientations as this model's outputs: turns from nominal (N, 3).
+        """Measured rotations (N, 3, 3) at commands (N, n) as turns from nominal (N, 3).
 
-        Args:
-            commands: (N, n) where they were measured.
-            rotations: (N, 3, 3) measured rotation matrices in the measuring frame.
-
-        Returns:
-            (N, 3) degrees, in the measuring frame.
+        In degrees and the measuring frame, as outputs of ``Pose`` are.
         """
-        from scipy.spatial.transform import Rotation
-
         commands = as_commands(self, commands)
         rotations = array_of("rotations", rotations, len(commands), 3, 3)
         nominal = self._nominal_rotations(commands)
@@ -110,12 +103,7 @@ class Arm:
         return np.asarray(Rotation.from_matrix(turn).as_rotvec(degrees=True))
 
     def rotations(self, commands: ArrayLike, vectors: ArrayLike) -> Array:
-        """Rotation matrices (N, 3, 3) of turns from nominal (N, 3) in degrees.
-
-        The inverse of ``rotation_vectors``.
-        """
-        from scipy.spatial.transform import Rotation
-
+        """Rotation matrices (N, 3, 3) of turns from nominal (N, 3) in degrees."""
         commands = as_commands(self, commands)
         turn = Rotation.from_rotvec(numbers("vectors", vectors), degrees=True)
         return np.asarray(turn.as_matrix() @ self._nominal_rotations(commands))
@@ -189,10 +177,11 @@ class Arm:
         return ratios, parameters[last : last + len(self.compliance)], waves
 
     def _swing(self, commands: Array, parameters: Array) -> tuple[Array, Array]:
-        """(H, 4, N) sin, cos of the joints and of twice them; (n, N) what they add.
-
-        The latter is how far each joint goes for one degree behind its gear.
-        """
+        """(H, 4, N) sin, cos of the joints and of twice them; (n, N) how far each joint
+        goes for one degree behind its gear."""
+        goes = np.ones((len(self.joints), len(commands)))
+        if not self.harmonics:
+            return np.zeros((0, 4, len(commands))), goes
         ratios, _, waves = self._drives(parameters)
         at = [i - 1 for i in self.harmonics]
         turns = np.radians((ratios * self._moves(commands)).T[at])
@@ -202,7 +191,6 @@ class Arm:
         shape = (len(at), 4, len(commands))
         by_waves = np.stack([sine, cosine], axis=2).reshape(shape)
         rates = (rate * np.stack([cosine, -sine], axis=2)).reshape(shape)
-        goes = np.ones((len(self.joints), len(commands)))
         goes[at] += np.einsum("hk,hkn->hn", waves, rates)
         return by_waves, goes
 
@@ -277,10 +265,8 @@ class Arm:
     def _motion(
         self, commands: Array, parameters: Array, at: NDArray[np.int64]
     ) -> tuple[Array, Array]:
-        """Derivative (N, q, S) of the readings by the steps ``at`` (S,), and (N, q, s).
-
-        The second is by the sensor's own parameters.
-        """
+        """Derivative (N, q, S) of the readings by the steps ``at`` (S,), and (N, q, s)
+        by the sensor's own parameters."""
         reading = self._reading(commands, parameters)
         frame, axes, origins = self._chain(commands, parameters)
         motion = np.zeros((len(at), 6, len(commands)))  # shift and turn of the tip
@@ -297,8 +283,7 @@ class Arm:
 
         Of contacts of turning joints, which touch as well with an arm of any size: the
         root of the sum of squares, of all postures, of how far the tip is from each
-        axis. It is an arm's size, and none of where it stands. By turns it is held. The
-        way of a slide that moves shows the size: None.
+        axis. By turns it is held. The way of a slide that moves shows the size: None.
         """
         if not self._grows(commands):
             return None
@@ -360,10 +345,8 @@ class Arm:
         return np.array([kind == "R" for kind in self.joints])
 
     def _pulled(self, commands: Array) -> tuple[Array, list[tuple[Array, Array]]]:
-        """The nominal arm's axes (n, 3, N), and of each load what a joint does to it.
-
-        The latter is the force (3,), and how its point moves by each joint (n, 3, N).
-        """
+        """The nominal arm's axes (n, 3, N); of each load its force (3,), and how its
+        point moves by each joint (n, 3, N)."""
         first = self.table.size + len(self.gears)
         stiff = self.nominal
         stiff[first : first + len(self.compliance)] = 0.0
@@ -394,9 +377,8 @@ class Arm:
     def _torque_slopes(self, commands: Array) -> Array:
         """(C, n, N) of the torques by the joints, per degree or unit of length.
 
-        A joint's torque is the work of the loads per radian, so its derivative by
-        another joint is a second derivative of their positions: ``w_i x J_j``, i before
-        j.
+        A torque is the work of the loads per radian, so its derivative is a second one
+        of their positions: ``w_i x J_j``, i before j.
         """
         axes, pulls = self._pulled(commands)
         at, joints = np.array(self.compliance)[:, None] - 1, np.arange(len(axes))
@@ -411,10 +393,8 @@ class Arm:
 
 
 def apparent_length(table: Array, tool: Array) -> tuple[float, int]:
-    """The length of links (n, 5) and a tool, and which row's ``d`` cancels with others.
-
-    Rows are counted from 1; 0 where none is out of all proportion.
-    """
+    """Length of links (n, 5) and a tool, and which row's ``d``, from 1, cancels with
+    others out of all proportion; 0 for none."""
     rest = np.linalg.norm(tool[:3, 3])
     plain = float(np.hypot(table[:, 0], table[:, 2]).sum() + rest)
     along, between = table[:, 2].copy(), np.radians(table[:, 1])

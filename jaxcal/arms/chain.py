@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.arguments import (
     joint_kinds,
@@ -23,16 +24,14 @@ from jaxcal.arms.arguments import (
     transform,
 )
 from jaxcal.arms.arm import Arm, Load, apparent_length
+from jaxcal.arms.files.urdf import joints_of, read_ur_kinematics, read_urdf
 from jaxcal.arms.sensors import Position, Sensor, Several
 from jaxcal.arms.sensors.sensor import BASE
-from jaxcal.arms.sensors.several import in_noise
+from jaxcal.arms.sensors.several import OneTable, stacked
 from jaxcal.checks import Array, array_of, axis_names, numbers, one_of
-from jaxcal.files import write_over
+from jaxcal.late import late
 from jaxcal.models.model import ErrorGroups, Model, Quantity, as_commands, as_parameters
-from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
-
-_POSTURES = 500  # that show where an arm stands
 
 COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # Standard deviations of the default prior. On a UR5 (links of 1.19 m in all): 1.8 mm,
@@ -48,8 +47,6 @@ _NEAR, _ALIKE = 0.2, 0.05
 # the axes, zeros of the joints, compliance, harmonics. Most arms have little misfit and
 # some have much.
 _SIZES, _SIZES_SPREAD = (1.0, 1.0, 1.0, 1.0, 0.1), (6.0, 6.0, 6.0, 6.0, 10.0)
-_BEYOND_TURNS = 20.0  # degrees: as radians, more turns than a joint makes
-_BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
 # Farther away, or turned by more than 37 degrees (a cosine), no fit of poses finds it.
 _AWAY, _ASIDE = 1.5, 0.8
 
@@ -60,19 +57,32 @@ class SerialChain(Arm, Model):
 
     A row of the table is ``Rz(theta + u) Tz(d) Tx(a) Rx(alpha) Ry(beta)`` in the
     standard convention and ``Tx(a) Rx(alpha) Ry(beta) Rz(theta + u) Tz(d)`` in the
-    modified one (a and alpha of the link before the joint). beta is zero in a DH table;
-    it is there because between parallel axes the other four cannot describe a small
-    misalignment by small numbers (Hayati).
+    modified one (a and alpha of the link before the joint). beta is zero in a DH table:
+    between parallel axes the other four cannot describe a small misalignment by small
+    numbers (Hayati).
 
     Parameters, in this order: ``a1 alpha1 d1 theta1 beta1 a2 ...``; ``gear1 ...`` and
-    ``compliance1 ...`` of those asked for; ``base x``, ``y``, ``z``, ``rx``, ``ry``,
-    ``rz``; what the sensor sees of ``tool x``, ``y``, ``z``, ``rx``, ``ry``, ``rz``;
-    the sensor's own; ``theta1 sin``, ``cos``, ``sin2``, ``cos2`` ... of the harmonics
-    asked for, always last. The turns of base and tool are relative to their nominal
-    rotation. Commands are the joints, then the columns that the sensor asks for.
-
-    Made by ``from_dh`` and ``from_urdf``.
+    ``compliance1 ...`` of those asked for; ``base x`` to ``rz``; what the sensor sees
+    of ``tool x`` to ``rz``; the sensor's own; ``theta1 sin``, ``cos``, ``sin2``,
+    ``cos2`` ... of the harmonics asked for. The turns of base and tool are relative to
+    their nominal rotation. Commands are the joints, then the columns that the sensor
+    asks for.
     """
+
+    # Of modules that know this one.
+    prepared = late("jaxcal.arms.plausible:prepared")
+    require_commands = late("jaxcal.arms.plausible:require_commands")
+    postures = late("jaxcal.arms.postures:postures")
+    reachable = late("jaxcal.arms.postures:reachable")
+    in_turn = late("jaxcal.arms.postures:in_turn")
+    improved = late("jaxcal.arms.effects:improved")
+    unexplained = late("jaxcal.arms.effects:unexplained")
+    verdict = late("jaxcal.arms.verdict:verdict")
+    at_rest = late("jaxcal.arms.files.recordings:at_rest")
+    recorded = late("jaxcal.arms.files.recordings:recorded")
+    write = late("jaxcal.arms.files.write:write")
+    standing_as = late("jaxcal.arms.files.write:standing_as")
+    write_servos = late("jaxcal.arms.files.servos:write_servos")
 
     @classmethod
     def from_dh(
@@ -106,30 +116,27 @@ class SerialChain(Arm, Model):
             joints: a letter a joint, R or P; all revolute when not given.
             base: where the arm stands in the measuring frame: (3,) or (4, 4).
             tool: the measured point in the last link's frame: (3,) or (4, 4).
-            sensor: measures the tip; of ``jaxcal.models``, or its ``to_dict()``;
-                Position() when not given.
-            gears: joints, counted from 1, whose gear ratio is a parameter ("gear2"):
-                the joint moves by the ratio, nominally 1, times its command.
-            compliance: revolute joints, counted from 1, that yield under the loads
+            sensor: measures the tip, or its ``to_dict()``; Position() when not given.
+            gears: joints, from 1, whose gear ratio, nominally 1, is a parameter
+                ("gear2").
+            compliance: revolute joints, from 1, that yield under the loads
                 ("compliance2"): degrees per unit of weight times length. By default all
-                joints for contacts, else none.
-            yields: (C,) the compliance of these joints, as far as it is known; 0 when
-                not given.
-            harmonics: revolute joints, counted from 1, with eccentric gears: they move
-                by sin and cos of their angle, and of twice it, besides.
-            waves: (H, 4) these in degrees, as far as they are known; 0 when not given.
+                for contacts, else none.
+            yields: (C,) nominal compliance of these joints.
+            harmonics: revolute joints, from 1, with eccentric gears: they move by sin
+                and cos of their angle, and of twice it, besides.
+            waves: (H, 4) these in degrees, nominally.
             loads: (link, weight, centre in the frame of that row); by default a weight
                 of one at the end of every link but the first, the last at the tool.
                 The torques are those of the nominal arm.
             gravity: direction of weight in the measuring frame; times 9.81 where
                 loads are masses.
-            joint_names: what the columns of the commands are called.
+            joint_names: of the columns of the commands.
             drive: (n, J) how far each joint moves with each of J columns, where they
                 are not the same (a joint that mimics another).
             offset: (n,) where each joint is at commands of zero.
             limits: (J, 2) least and greatest command of each column.
-            source: the URDF file that the arm comes from: its text, the base and tip
-                links and the locked joints.
+            source: the URDF file that the arm comes from: text, base, tip, locked.
         """
         rows = rows_of(table)
         n = len(rows)
@@ -148,8 +155,7 @@ class SerialChain(Arm, Model):
                 stacklevel=2,
             )
         if compliance is None:
-            turning = [i + 1 for i in range(n) if joints[i] == "R"]
-            compliance = turning if sensor.compliant else ()
+            compliance = turning(joints) if sensor.compliant else ()
         bending = joint_numbers("compliance", compliance, joints, "R")
         bent = joint_numbers("harmonics", harmonics, joints, "R")
         if bending and not len(loads):
@@ -190,31 +196,24 @@ class SerialChain(Arm, Model):
     ) -> Self:
         """The arm between two links of a URDF file, as a standard table with beta.
 
-        Lengths are in metres as in the file, angles in degrees; the tip goes where the
-        file puts it at every posture. A joint that mimics another moves with its
-        leader's column; limits are read.
+        Lengths are in metres, angles in degrees; the tip goes where the file puts it at
+        every posture. A joint that mimics another moves with its leader's column;
+        limits are read.
 
         Args:
             path: a URDF file; xacro files must be expanded first.
-            base: link that the outputs are relative to, anywhere in the tree; the root
-                by default.
-            tip: link whose origin is the measured point, anywhere in the tree; the only
-                last one by default.
+            base: link that the outputs are relative to, anywhere in the tree; else the
+                root.
+            tip: link whose origin is the measured point; else the only last one.
             sensor: measures the tip; Position() when not given.
             locked: fixed joints by name, with their values: degrees, metres.
             limits: least and greatest command of joints, by name, instead of the
                 file's.
-            options: ``gears``, ``compliance``, ``loads``, ``gravity`` of
-                ``from_dh``.
+            options: ``gears``, ``compliance``, ``loads``, ``gravity`` of ``from_dh``.
         """
-        # scipy.spatial and the XML parser take half a second to load.
-        from jaxcal.arms.files.urdf import read_urdf
-
         arm = read_urdf(path, tip, base, locked or {})
-        for name, ends in (limits or {}).items():
-            joint = one_of("limits", name, tuple(arm["joint_names"]))
-            arm["limits"][arm["joint_names"].index(joint)] = ends
-        return cls.from_dh(**arm, sensor=sensor, **options)
+        chain = cls.from_dh(**arm, sensor=sensor, **options)
+        return chain._limited(limits or {})
 
     @classmethod
     def from_ur_kinematics(
@@ -226,17 +225,21 @@ class SerialChain(Arm, Model):
     ) -> Self:
         """The arm of a kinematics file of Universal Robots' ROS description, in metres.
 
-        That which ``calibration.to_ur_kinematics`` writes; the base is the robot's, the
-        tip its flange.
-
         Args:
-            path: the .yaml.
+            path: the .yaml, as of ``calibration.to_ur_kinematics``; from the robot's
+                base to its flange.
             sensor: measures the tip; Position() when not given.
             options: of ``from_dh`` beside the table: ``tool``, ``base``, ``limits``.
         """
-        from jaxcal.arms.files.urdf import read_ur_kinematics
-
         return cls.from_dh(**(read_ur_kinematics(path) | options), sensor=sensor)
+
+    def _limited(self, limits: Mapping[str, tuple[float, float]]) -> Self:
+        """This arm with other limits of joints by name."""
+        pairs = self.limits.copy()
+        for name, ends in limits.items():
+            joint = one_of("limits", name, self.joint_names)
+            pairs[self.joint_names.index(joint)] = ends
+        return dataclasses.replace(self, limits=limits_of(pairs, len(pairs)))
 
     def measured_with(self, sensor: Sensor) -> Self:
         """This arm with another sensor."""
@@ -249,11 +252,7 @@ class SerialChain(Arm, Model):
         return self.measured_with(self.sensor.with_members(members))
 
     def with_misfit(self) -> Self:
-        """This arm with harmonics of its joints.
-
-        They are no parameters of the arm: ``identify``, and ``select`` for predictions,
-        count on them where no prior is given, as what the parameters do not explain.
-        """
+        """This arm with harmonics of its joints: what the parameters do not explain."""
         return self._bent
 
     def with_effects(
@@ -263,7 +262,7 @@ class SerialChain(Arm, Model):
         gears: Sequence[int] | None = None,
         harmonics: Sequence[int] | None = None,
     ) -> Self:
-        """This arm with these effects of joints, counted from 1, as of ``from_dh``."""
+        """This arm with these effects of joints, from 1, as of ``from_dh``."""
         arm: dict[str, Any] = {}
         if compliance is not None and not self.compliance:
             arm["compliance"] = tuple(compliance)
@@ -276,28 +275,11 @@ class SerialChain(Arm, Model):
             arm["waves"] = np.zeros((len(arm["harmonics"]), 4))
         return dataclasses.replace(self, **arm)
 
-    def improved(self, fit: Any) -> Any:
-        """With what held-out readings ask for, where the noise explains too little."""
-        from jaxcal.arms.effects import chosen
-
-        return chosen(fit)
-
-    def unexplained(self, fit: Any, rows: Array) -> Array:
-        """Scatter that no noise explains, more beyond the range that was measured."""
-        from jaxcal.arms.effects import unexplained
-
-        return unexplained(fit, rows)
-
     @functools.cached_property
     def _bent(self) -> Self:  # kept, and what it keeps with it
         if self.harmonics or "R" not in self.joints:
             return self
-        return self.with_effects(harmonics=self._turning)
-
-    @property
-    def _turning(self) -> list[int]:
-        """Joints that turn, counted from 1."""
-        return [i + 1 for i, kind in enumerate(self.joints) if kind == "R"]
+        return self.with_effects(harmonics=turning(self.joints))
 
     @property
     def misfit_std(self) -> float:
@@ -308,314 +290,24 @@ class SerialChain(Arm, Model):
     def fits_misfit(self) -> bool:
         return not self.sensor.local
 
-    def postures(
-        self,
-        count: int,
-        *,
-        seed: int = 0,
-        near: ArrayLike | None = None,
-        allowed: Callable[[NDArray[np.float64]], bool] | None = None,
-        camera: ArrayLike | None = None,
-        distance: Sequence[float] | None = None,
-        tilt: float | None = None,
-        side: str | None = None,
-        floor: float | None = None,
-        approach: ArrayLike | None = None,
-        clear: Sequence[ArrayLike] = (),
-        radius: float | None = None,
-    ) -> Array:
-        """Postures that can be measured, to choose from.
-
-        Within the limits (180 degrees where a file has none), two degrees apart at
-        least, with the ball in the socket, the probe on the plane or the board in view
-        (without ``camera`` from either side): inverse kinematics from random starts, so
-        a redundant arm's self-motions are among them.
-
-        Args:
-            count: how many.
-            seed: of the random starts.
-            near: rough places: (S, 3) sockets or (S, 4) planes if the sensor has no
-                places; for a sensor that reads everywhere rows (x, y, z, radius), of
-                which the tip must be near one; not for a board.
-            allowed: function of joints (J,), False where they collide.
-            camera: of a board, (width, height, fx, fy, cx, cy) in pixels, or a field of
-                view in degrees (horizontal, vertical): every corner is in the picture,
-                with a focal length that is known to a tenth.
-            distance: least and greatest, of the board's middle from that camera; such
-                that the board fills 25 to 80 % of the picture when not given.
-            tilt: degrees that the board's face may be turned from the camera; 45 when
-                not given.
-            side: "+z", the printed side is where the board's z axis points, or "-z";
-                known of a board that was found from views, else from either side.
-            floor: lowest height (z in the measuring frame) of joints, and of sockets
-                within 1 % of the arm's length.
-            approach: direction (x, y, z) of the tool's approach, from the last joint to
-                the tip, and the largest angle from it in degrees (60).
-            clear: planes (normal, offset) whose other side, and boxes (least x, y, z,
-                greatest), that the arm does not touch: spheres along straight lines
-                between the joints, no shapes of the links. The first link and the tip
-                are not looked at, nor is the arm against itself.
-            radius: of the spheres that keep clear; 4 % of the arm's length when not
-                given.
-
-        Returns:
-            (count, n) commands with the sensor's columns, in an order of little travel.
-
-        Raises:
-            ValueError: there are fewer, or a socket cannot be reached; the message
-                counts the reasons.
-        """
-        where = self.reachable(
-            near=near,
-            allowed=allowed,
-            camera=camera,
-            distance=distance,
-            tilt=tilt,
-            side=side,
-            floor=floor,
-            approach=approach,
-            clear=clear,
-            radius=radius,
-        )
-        return np.asarray(where.drawn(count, seed))
-
-    def reachable(self, **rules: Any) -> Any:
-        """Where the arm can be measured: ``allowed`` of ``Design.refine``.
-
-        Arguments as of ``postures``, from ``near`` on. Commands that a search tries are
-        moved to where the sensor reads: the ball into its socket, the board as the
-        camera sees it.
-        """
-        from jaxcal.arms.postures import ReachableSet
-
-        return ReachableSet(self, **rules)
-
-    def require_commands(self, commands: Array) -> None:
-        """Refuse radians for degrees, and joints far beyond their limits."""
-        low, high = self.limits.T
-        units = np.array(self.command_units)
-        joints = commands[:, : self.num_joints]
-        for _, one, rows, _ in self.sensor.parts(commands[:, self.num_joints :]):
-            largest = np.abs(joints[rows][:, units == "deg"]).max(initial=0.0)
-            small = self.num_joints > 2 and 1.0 < largest < 7.0
-            if small and not one.positions:  # readings tell of these
-                raise ValueError(
-                    f"commands must be in degrees, but no angle exceeds {largest:.3g}: "
-                    "are they radians? Use np.degrees(commands), --radians"
-                )
-        largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
-        twice = np.degrees(_BEYOND_TURNS)
-        if largest > twice and self.num_joints > 2:
-            raise ValueError(
-                f"commands must be in degrees, but angles reach {largest:.6g}: were "
-                "degrees converted as if they were radians? Leave out np.degrees, "
-                "--radians"
-            )
-        slack = np.where(units == "deg", _BEYOND, 0.01 * _BEYOND * (high - low))
-        far = np.argwhere((joints < low - slack) | (joints > high + slack))
-        for row, joint in far[:1]:
-            name, column = self.joint_names[joint], -joints[:, joint]
-            least, most = (low - slack)[joint], (high + slack)[joint]
-            around = np.where(-column > 180.0, -column - 360.0, -column)
-            turning = units[joint] == "deg" and -column.min() >= 0.0
-            if turning and ((around >= least) & (around <= most)).all():
-                advice = f"{name} seems to be read in 0 to 360: subtract 360 from what "
-                advice += "is above 180."
-            elif ((column >= least) & (column <= most)).all():
-                advice = f"{name} seems reversed: with the other sign all rows are "
-                advice += "within the limits. Negate that column."
-            elif len(column) > 1 and not np.ptp(column):
-                advice = f"it is the same in all {len(column)} rows: was it recorded?"
-            else:
-                advice = "are the columns in this order: "
-                advice += f"{', '.join(self.joint_names)}?"
-            raise ValueError(
-                f"row {row}: {name} = {joints[row, joint]:g} is outside its limits "
-                f"({low[joint]:g} to {high[joint]:g}) by more than {slack[joint]:g}; "
-                f"{advice} If the file's limits are wrong, give "
-                f"limits={{name: (low, high)}}, --limits"
-            )
-
-    def prepared(self, commands: Array, measured: Array | None = None) -> Self:
-        """This arm with its sensor where commands (and readings) put it.
-
-        Raises:
-            ValueError: readings in another unit, of another arm or place, radians for
-                degrees, joints beyond their limits.
-        """
-        from jaxcal.arms.plausible import require_touched
-
-        self.require_readings(commands, measured)
-        arm = self.located(commands, measured)
-        if measured is not None:
-            tip, inputs = arm.nominal_tip(commands), commands[:, self.num_joints :]
-            for part in arm.sensor.of_members(tip, inputs, measured):
-                require_touched(part.sensor, part.columns)
-        arm.require_places(commands, measured)
-        return arm
-
     @property
     def sensed(self) -> slice:
-        """What its sensor asks for: labels of what was touched, the pose of a board."""
         return slice(self.num_joints, self.num_inputs)
 
     def anew(self, commands: Array, measured: Array) -> Self:
         """This arm located again, what its sensor reads forgotten."""
         names = {field.name for field in dataclasses.fields(self.sensor)}
         places = {name: None for name in ("place", "places") if name in names}
-        sensor = dataclasses.replace(self.sensor, **places)
-        arm = dataclasses.replace(self, sensor=sensor)
-        return arm.located(commands, None if not measured.any() else measured)
-
-    def require_readings(self, commands: Array, measured: Array | None) -> None:
-        """Refuse what no arm like this one takes or gives; None, candidates."""
-        from jaxcal.arms.plausible import require_readings, warn_of_radians
-
-        if measured is None:
-            self.require_commands(commands)
-            warn_of_radians(self, commands)
-            return
-        for part in self.of_each_sensor(commands, measured):
-            require_readings(*part)
-        self.require_commands(commands)
-
-    def require_places(self, commands: Array, measured: Array | None) -> None:
-        """Refuse contacts of other places; warn of views without the board."""
-        from jaxcal.arms.plausible import require_sockets, warn_of_picture
-
-        if measured is None:
-            warn_of_picture(self, commands)
-            return
-        for part in self.of_each_sensor(commands, measured):
-            require_sockets(*part)
+        arm = self.measured_with(dataclasses.replace(self.sensor, **places))
+        return arm.located(commands, measured if measured.any() else None)
 
     def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
-        """(K,) the rows that count: contacts written twice count once."""
         kept = [np.zeros(0, dtype=np.intp)]
         for _, one, rows, _ in self.sensor.parts(commands[:, self.num_joints :]):
             if one.zeros and not measured[rows].any():
                 rows = rows[np.unique(commands[rows], axis=0, return_index=True)[1]]
             kept.append(rows)
         return np.sort(np.concatenate(kept))
-
-    def at_rest(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        seconds: float = 0.5,
-        within: float | None = None,
-    ) -> Array:
-        """Postures (N, J) at which a recorded arm stood still, in their order.
-
-        Args:
-            path: rosbag2 folder (SQLite or MCAP) with joint states, joints by name in
-                any order. Needs the extra ``ros``.
-            seconds: of rest, at least.
-            within: degrees (or units of length) in which a resting joint stays. When
-                not given 0.05, or eight times what the joint's readings jitter by.
-
-        Raises:
-            ValueError: the arm never stood still; it says how the joints jitter.
-        """
-        return self._rests(Recording(path, seconds=seconds, within=within))[0]
-
-    def _rests(
-        self, recording: Recording, kind: str = ""
-    ) -> tuple[Array, Array | None]:
-        from jaxcal.arms.files.recordings import rests_of
-
-        turning = np.array(self.command_units) == "deg"
-        return rests_of(recording, self.joint_names, turning, kind)
-
-    def recorded(self, recording: Recording) -> tuple[Array, Array | None]:
-        """Commands (N, n) and readings (N, q) of a recording, the mean of each rest.
-
-        Readings are zeros of contacts and of poses of a board, which stand in the
-        commands, and None of a sensor whose readings no message holds (corners'
-        pixels), or of a LeRobot dataset.
-
-        Raises:
-            ValueError: the arm never stood still; ``which`` has not as many as there
-                were rests; there are no readings.
-        """
-        sensor = self.sensor
-        views = sensor.views and sensor.zeros
-        if not views and tuple(sensor.inputs) not in ((), (sensor.kind,)):
-            raise ValueError(
-                f"commands of a {sensor.kind} need {', '.join(sensor.inputs)}, which "
-                "no recording has; pass the postures of at_rest"
-            )
-        pixels = sensor.views and not views
-        commands, read = self._rests(recording, "" if pixels else sensor.kind)
-        if views:
-            from scipy.spatial.transform import Rotation
-
-            if read is None:
-                raise ValueError(f"{recording.path} has no board poses")
-            turns = Rotation.from_matrix(read[:, 3:].reshape(-1, 3, 3).swapaxes(1, 2))
-            turns_deg = np.degrees(turns.as_rotvec())
-            commands = np.column_stack([commands, read[:, :3], turns_deg])
-        elif sensor.inputs:
-            which = () if recording.which is None else recording.which
-            if len(which) != len(commands):
-                raise ValueError(
-                    f"which must give the {sensor.kind} of each of the {len(commands)} "
-                    f"rests, got {len(which)} numbers"
-                )
-            commands = np.column_stack([commands, numbers("which", which)])
-        if sensor.zeros:
-            return commands, np.zeros((len(commands), len(sensor.outputs)))
-        if read is not None and self.relative:
-            matrices = read[:, 3:].reshape(-1, 3, 3).transpose(0, 2, 1)
-            turned = self.rotation_vectors(commands, matrices)
-            read = np.hstack([read[:, :3], turned])
-        return commands, read
-
-    def write_servos(
-        self,
-        path: str | os.PathLike[str],
-        parameters: ArrayLike,
-        servos: str | os.PathLike[str],
-        names: Mapping[str, str],
-        *,
-        force: bool = False,
-    ) -> dict[str, int]:
-        """Write LeRobot's calibration file with the joints' zeros of ``parameters``.
-
-        Of a turning joint's zero alone: what lengths and axes do is not in it.
-
-        Args:
-            path: the file to write.
-            parameters: (p,).
-            servos: the file that is corrected.
-            names: motors whose names differ from the joints'.
-            force: overwrite an existing file.
-
-        Returns:
-            Steps by which the middle of each motor's range moved.
-        """
-        from jaxcal.arms.files.servos import Servos
-
-        theta = as_parameters(self, parameters)
-        rows = (theta - self.nominal)[: self.table.size].reshape(self.table.shape)
-        ahead = {}
-        for column, (name, unit) in enumerate(
-            zip(self.joint_names, self.command_units, strict=True)
-        ):
-            moved = np.flatnonzero(self.drive[:, column])
-            if unit == "deg" and len(moved) == 1:
-                zero = rows[moved[0], 3] / self.drive[moved[0], column]
-                ahead[names.get(name, name)] = float(zero)
-        old = Servos.load(servos)
-        new = old.moved(ahead)
-        new.save(path, force=force)
-        return {name: round(new.middle(name) - old.middle(name)) for name in ahead}
-
-    def in_turn(self, commands: ArrayLike) -> NDArray[np.int64]:
-        """(N,) the commands' rows in an order of little travel, socket after socket."""
-        from jaxcal.arms.postures import in_turn
-
-        return in_turn(as_commands(self, commands), self.num_joints)
 
     def skeleton(self, commands: ArrayLike) -> Array:
         """(N, n + 2, 3) the base, each joint's origin and the tip, to be drawn."""
@@ -626,12 +318,8 @@ class SerialChain(Arm, Model):
         return np.asarray(points.transpose(2, 0, 1))
 
     def calibrated(self, parameters: ArrayLike, sensor: Sensor | None = None) -> Self:
-        """The arm whose nominal is this one with ``parameters``.
-
-        Args:
-            parameters: (p,) as ``identify`` found them.
-            sensor: of the new arm; Position() when not given.
-        """
+        """The arm whose nominal is this one with ``parameters`` (p,), with a
+        ``sensor``, else Position()."""
         theta = as_parameters(self, parameters)
         ratios, compliance, waves = self._drives(theta)
         base, tool, _ = self._split(theta)
@@ -655,108 +343,18 @@ class SerialChain(Arm, Model):
         """This arm with stiff joints and round gears, as files have them."""
         if not self.compliance and not self.harmonics:
             return self
-        return dataclasses.replace(
-            self,
-            compliance=(),
-            yields=np.zeros(0),
-            harmonics=(),
-            waves=np.zeros((0, 4)),
-        )
-
-    def standing_as(self, other: Any, parameters: Array, commands: Array) -> Array:
-        """(p,) ``parameters``, the base where the tip is nearest to that of ``other``.
-
-        Over all postures within the limits of the joints; where there are none, within
-        a turn or the range of ``commands``.
-        """
-        from scipy.spatial.transform import Rotation
-
-        joints = commands[:, : self.num_joints]
-        turns = np.array(self.command_units)[:, None] == "deg"
-        limits = np.where(turns, self.limits.clip(-180.0, 180.0), self.limits)
-        ranges = np.column_stack([joints.min(axis=0), joints.max(axis=0)])
-        low, high = np.where(np.isfinite(limits), limits, ranges).T
-        rng = np.random.default_rng(0)
-        postures = rng.uniform(low, high, (_POSTURES, len(low)))
-        tips = self.calibrated(parameters).predict(postures)
-        targets = np.asarray(other.predict(postures))
-        turn, _ = Rotation.align_vectors(
-            targets - targets.mean(axis=0), tips - tips.mean(axis=0)
-        )
-        at = [self.names.index(name) for name in BASE]
-        base = pose_matrix(parameters[at])
-        moved = parameters.copy()
-        place = turn.apply(base[:3, 3] - tips.mean(axis=0)) + targets.mean(axis=0)
-        turned = (turn * Rotation.from_matrix(base[:3, :3])).as_euler("XYZ", True)
-        moved[at] = np.concatenate([place, turned])
-        return moved
-
-    def write(
-        self,
-        form: str,
-        path: str | os.PathLike[str],
-        parameters: ArrayLike,
-        *,
-        force: bool = False,
-    ) -> str:
-        """Write the arm with ``parameters`` as a file that robots read.
-
-        Such files cannot hold compliance and gear harmonics: these are left out, with a
-        warning.
-
-        Args:
-            form: "urdf" is the file that the arm came from, its origins corrected:
-                meshes, comments and all else stay as they are, and the tip goes where
-                ``predict`` of positions puts it, the base in the measuring frame
-                included. "dh" is the table as CSV: joint, a, alpha, d, theta (with the
-                joint's offset), beta, without base, tool and convention; joints that
-                follow others are named in a warning. "ur" is the YAML file of Universal
-                Robots' ROS description, for six joints, without base and tool.
-            path: the file to write.
-            parameters: (p,) as ``identify`` found them.
-            force: overwrite an existing file.
-
-        Returns:
-            Of "urdf" the tip link, a new one where no fixed joint before it could hold
-            the tool; else "".
-
-        Raises:
-            ValueError: the arm is not of the form, which of "ur" joints that follow
-                others are not; a gear ratio was found, which none can hold.
-            FileExistsError: there is a file and ``force`` is not given.
-        """
-        from jaxcal.arms.files.write import written
-
-        ratios, yields, waves = self._drives(as_parameters(self, parameters))
-        for i in np.flatnonzero(ratios != 1.0):
-            raise ValueError(
-                f"gear{i + 1} is {ratios[i]:.6g}, which this file format cannot hold"
-            )
-        lost = [f"compliance{self.compliance[i]}" for i in np.flatnonzero(yields)]
-        bent = np.flatnonzero(waves.any(axis=1))
-        lost += [f"harmonics of joint {self.harmonics[i]}" for i in bent]
-        if lost:
-            warnings.warn(
-                f"{', '.join(lost)} left out: the file cannot hold compliance and gear "
-                "harmonics",
-                stacklevel=2,
-            )
-        text, tip = written(form, self, self.calibrated(parameters))
-        write_over(path, text, force)
-        return tip
+        arm = dataclasses.replace(self, compliance=(), yields=np.zeros(0))
+        return dataclasses.replace(arm, harmonics=(), waves=np.zeros((0, 4)))
 
     def together(
         self, *tables: tuple[ArrayLike, ArrayLike | None]
     ) -> tuple[Array, Array]:
-        """Commands and readings of several sensors as the tables that a fit takes.
+        """Commands (N, n) and readings (N, q) in noise of several sensors, for a fit.
 
         Args:
-            tables: for each sensor of ``Several`` a pair: commands (N, n) with the
-                columns that it asks for, and what it measured (N, q), or None for
-                zeros (contacts) and for candidates.
-
-        Returns:
-            Commands (N, n) and readings (N, q), each in units of its sensor's noise.
+            tables: for each sensor of ``Several`` a pair: commands with the columns
+                that it asks for, and what it measured, or None for zeros (contacts) and
+                candidates.
         """
         if not isinstance(self.sensor, Several):
             raise ValueError("together needs an arm with sensor=Several(...)")
@@ -766,24 +364,19 @@ class SerialChain(Arm, Model):
                 f"each of the {len(sensors)} sensors needs a pair (commands, "
                 f"measured), got {len(tables)} pairs"
             )
-        all_commands, all_measured = [], []
-        for i, (one, (given, readings)) in enumerate(zip(sensors, tables, strict=True)):
-            columns = [j + self.sensor.inputs.index(name) for name in one.inputs]
-            columns = [*range(j), *columns]
-            given = array_of(f"commands of {one.kind}", given, "N", len(columns))
-            commands = np.zeros((len(given), self.num_inputs))
-            commands[:, j], commands[:, columns] = i, given
-            all_commands.append(commands)
-            noise, q = one.stds(self.length), self.num_outputs
-            all_measured.append(in_noise(one.kind, readings, len(given), noise, q))
-        return np.vstack(all_commands), np.vstack(all_measured)
+        named = []
+        for i, (one, table) in enumerate(zip(sensors, tables, strict=True)):
+            at = [j + self.sensor.inputs.index(name) for name in one.inputs]
+            noise = one.stds(self.length)
+            named.append(OneTable(one.kind, i, [*range(j), *at], noise, *table))
+        return stacked(named, j, self.num_inputs, self.num_outputs)
 
     def located(self, commands: ArrayLike, measured: ArrayLike | None = None) -> Self:
         """This arm with its sensor located by nominal postures and readings.
 
-        Nothing is changed that was given: sockets, planes, anchors, boards and their
-        cameras have no place of their own until the first readings. Of a tracker that
-        is far from where it was said to be the base is found.
+        Sockets, planes, anchors, boards and cameras have no place, unless it was given,
+        until the first readings. Of a tracker that is far from where it was said to be
+        the base is found.
 
         Raises:
             ValueError: the readings fit no such arm, or that of a Pose in another base.
@@ -856,14 +449,11 @@ class SerialChain(Arm, Model):
             joint = int(np.abs(np.abs(column) - 1.0).argmin())
             kind = self.joints[joint]
             if column[joint] != 1.0 and self.source is not None:
-                from jaxcal.arms.files.urdf import joints_of
-
                 kind = joints_of(self.source["text"])[name].kind
             kinds.append("deg" if kind == "R" else "length")
         return tuple(kinds)
 
     def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
-        """What its sensor reads, in its units."""
         return self.quantities_of(self.sensor, measured_unit)
 
     def quantities_of(self, sensor: Sensor, measured_unit: str) -> tuple[Quantity, ...]:
@@ -897,11 +487,6 @@ class SerialChain(Arm, Model):
         before = len(self.names) - self.waves.size - len(self.sensor.names)
         return slice(before + at.start, before + at.stop)
 
-    @property
-    def num_parameters(self) -> int:
-        """p."""
-        return len(self.names)
-
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         n = len(self.joints)
@@ -932,7 +517,6 @@ class SerialChain(Arm, Model):
     def predict(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        """Readings (N, q)."""
         commands = as_commands(self, commands)
         parameters = as_parameters(self, parameters)
         return self._reading(commands, parameters).values.copy()
@@ -940,7 +524,6 @@ class SerialChain(Arm, Model):
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        """(N, q, p)."""
         commands = as_commands(self, commands)
         parameters = as_parameters(self, parameters)
         columns, by_sensor = self._motion(
@@ -948,38 +531,30 @@ class SerialChain(Arm, Model):
         )
         first = 5 * len(self.joints)
         last = first + len(self.gears)
-        if self.harmonics:
-            swing, goes = self._swing(commands, parameters)
+        swing, goes = self._swing(commands, parameters)
         if self.gears:
             at = [i - 1 for i in self.gears]
-            moves = self._moves(commands)[:, at]
-            if self.harmonics:
-                moves = moves * goes[at].T
+            moves = self._moves(commands)[:, at] * goes[at].T
             columns[..., first:last] *= moves[:, None]
         if self.compliance:
             torque = self._torque(commands).T
             columns[..., last : last + len(self.compliance)] *= torque[:, None]
-        if not self.harmonics:
-            return np.concatenate([columns, by_sensor], axis=-1)
-        waves = swing.reshape(self.waves.size, -1).T[:, None]
-        waves = waves * columns[..., -self.waves.size :]
-        columns = columns[..., : -self.waves.size]
+        columns, waves = np.split(
+            columns, [columns.shape[-1] - self.waves.size], axis=-1
+        )
+        waves *= swing.reshape(self.waves.size, len(commands)).T[:, None]
         return np.concatenate([columns, by_sensor, waves], axis=-1)
 
     def command_jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        """(N, q, n), zero by the sensor's columns.
-
-        Of a pose, with the orientation that it is compared with held.
-        """
+        """(N, q, n), zero by the sensor's columns; of a pose, with the orientation that
+        it is compared with held."""
         commands = as_commands(self, commands)
         parameters = as_parameters(self, parameters)
         columns, _ = self._motion(commands, parameters, self._steps_of_joints)
         gears, compliance, _ = self._drives(parameters)
-        result = columns * gears
-        if self.harmonics:
-            result *= self._swing(commands, parameters)[1].T[:, None]
+        result = columns * gears * self._swing(commands, parameters)[1].T[:, None]
         if self.compliance:
             at = [i - 1 for i in self.compliance]
             rate = compliance[:, None, None] * self._torque_slopes(commands)
@@ -988,39 +563,28 @@ class SerialChain(Arm, Model):
         return np.concatenate([result @ self.drive, by_inputs], axis=-1)
 
     def wrapped(self, off: Array, commands: Array) -> Array:
-        """(N, q) differences of readings, those of the sensor that wrap within half a
-        period."""
         return self.sensor.wrapped(off, commands[:, self.num_joints :], self.length)
 
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
-        """What is known besides the prior, as readings that need no posture.
-
-        Returns:
-            (F,) how far off it is and (F, p) its derivative, in standard deviations.
-        """
         parameters = as_parameters(self, parameters)
         of_sensor = self._split(parameters)[2]
         off, rows = self.sensor.facts(of_sensor)
-        after = np.zeros((len(off), self.waves.size))
-        before = np.zeros(
-            (len(off), len(parameters) - len(of_sensor) - self.waves.size)
-        )
-        return off, np.hstack([before, rows, after])
+        last = len(parameters) - self.waves.size
+        slopes = np.zeros((len(off), len(parameters)))
+        slopes[:, last - len(of_sensor) : last] = rows
+        return off, slopes
 
     def default_noise(self) -> Noise:
-        """What ``select`` takes where no noise is given: the sensor's."""
         return Noise(std=self.sensor.stds(self.length or 1.0))
 
     def noise_with_play(self, play: ArrayLike) -> Noise:
-        """The sensor's noise plus the backlash of the joints.
+        """The sensor's noise plus the backlash of the joints, for ``identify`` and
+        ``select``.
 
         Args:
             play: total width of the backlash in degrees (or units of length): one
-                number or (J,); about 0.3 for hobby servos.
-
-        Returns:
-            Noise for ``identify`` and ``select``: a joint is off by its backlash over
-            the square root of twelve.
+                number or (J,); about 0.3 for hobby servos. A joint is off by it over
+                the square root of 12.
         """
         width = np.broadcast_to(numbers("play", play), (self.num_joints,))
         if not (width >= 0.0).all():
@@ -1032,8 +596,7 @@ class SerialChain(Arm, Model):
     def from_one_side(self, commands: ArrayLike, by: float) -> Array:
         """Joints (N, J) at which to start each move, so that all arrive from below.
 
-        The backlash is then always on the same side: an error of the joint's zero, not
-        of each reading.
+        The backlash is then an error of the joint's zero, not of each reading.
 
         Args:
             commands: (N, n) postures.
@@ -1048,8 +611,8 @@ class SerialChain(Arm, Model):
     def default_prior(self) -> Prior:
         """Loose knowledge of any arm, by the length of its links; see the constants.
 
-        What the sensor cannot see is held; the scales of the groups are taken from the
-        readings (``Prior.sized``).
+        What the sensor cannot see is held; the groups' scales are taken from the
+        readings.
         """
         length = self.length or np.inf  # axes of unknown stroke alone
         joint = [_LENGTH * length, _TWIST, _LENGTH * length, _ZERO, _TWIST]
@@ -1071,10 +634,8 @@ class SerialChain(Arm, Model):
         )
 
     def parameter_sizes(self) -> Array:
-        """(p,) of the default prior; where it says nothing the arm's length, a radian.
-
-        Where things stand is no size: a board may lie at a height of rounding.
-        """
+        """(p,) of the default prior; where it says nothing the arm's length, a radian:
+        where things stand is no size."""
         sizes = super().parameter_sizes()
         unknown = self.default_prior().resolve(self).precisions == 0.0
         units = np.array(self.units)
@@ -1092,7 +653,6 @@ class SerialChain(Arm, Model):
 
     @property
     def placed(self) -> tuple[str, ...]:
-        """The sensor's own parameters."""
         return self.sensor.names
 
     @property
@@ -1103,7 +663,6 @@ class SerialChain(Arm, Model):
 
     @property
     def relative(self) -> bool:
-        """The turns of a pose are from the nominal orientation at the command."""
         return self.sensor.relative
 
     def targets(
@@ -1125,19 +684,14 @@ class SerialChain(Arm, Model):
 
         return goal
 
-    def verdict(self, fit: Any) -> Any:
-        """``jaxcal.arms.verdict.ArmVerdict`` of a calibration."""
-        from jaxcal.arms.verdict import verdict
-
-        return verdict(fit)
-
     def to_dict(self) -> dict[str, Any]:
         """What a file holds of the model."""
         fields = (field.name for field in dataclasses.fields(self))
-        data = {name: getattr(self, name) for name in fields if name != "sensor"}
-        for name, value in data.items():
-            if isinstance(value, np.ndarray):
-                data[name] = value.tolist()
+        values = {name: getattr(self, name) for name in fields}
+        data = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in values.items()
+        }
         # JSON knows no infinity: null is a limit that is not known.
         ends = [
             [end if np.isfinite(end) else None for end in row] for row in self.limits
@@ -1147,20 +701,21 @@ class SerialChain(Arm, Model):
 
 
 def _far(points: Array, measured: Array, length: float) -> Array:
-    """(4, 4) that takes nominal points (N, 3) to those measured, if those are far off.
-
-    It stays one where the fit finds the base by itself, or no other explains them.
-    """
+    """(4, 4) that takes nominal points (N, 3) to those measured, if those are far off
+    and it explains them; else one."""
     moved, off = np.eye(4), np.linalg.norm(measured - points, axis=1)
     if len(points) < 4 or np.median(off) < _NEAR * length:
         return moved
-    from scipy.spatial.transform import Rotation
-
     middle, there = points.mean(axis=0), measured.mean(axis=0)
     turn = Rotation.align_vectors(measured - there, points - middle)[0].as_matrix()
     moved[:3, :3], moved[:3, 3] = turn, there - turn @ middle
     errors = np.linalg.norm(points @ turn.T + moved[:3, 3] - measured, axis=1)
     return moved if np.median(errors) < _ALIKE * length else np.eye(4)
+
+
+def turning(joints: str) -> list[int]:
+    """Joints that turn, counted from 1."""
+    return [i + 1 for i, kind in enumerate(joints) if kind == "R"]
 
 
 def _numbered(columns: int) -> tuple[str, ...]:

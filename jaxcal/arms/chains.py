@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.chain import COLUMNS, SerialChain
-from jaxcal.arms.plausible import require_touched
+from jaxcal.arms.findings import CLEAR_UP, Part, other_distances
+from jaxcal.arms.plausible import require_places, require_readings, require_touched
 from jaxcal.arms.sensors import Sensor, Tip
 from jaxcal.arms.sensors.sensor import BASE, Readings, label
-from jaxcal.arms.sensors.several import in_noise
+from jaxcal.arms.sensors.several import OneTable, stacked
 from jaxcal.calibration import verdict as models
-from jaxcal.checks import Array, array_of, one_of
+from jaxcal.checks import Array, one_of
 from jaxcal.files import write_over
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise, Prior
@@ -34,14 +35,13 @@ class Chains(Model):
     Chains that begin with the same joints (a torso's) share these joints' columns, and
     the parameters of the links between them. A sensor that is given to several chains
     as one object, by itself or in ``Several``, is one: both arms touch the same
-    sockets, and what of them has no place is found from the arm that reads it most. All
-    else is each chain's own, named ``left: a3``.
+    sockets, which are found from the arm that reads them most. All else is each chain's
+    own, named ``left: a3``.
 
     Commands are the columns of all joints, 0 where they are not of the row's chain;
     ``chain``, which says of each row whose tip was read, from 0; and the sensors'
-    columns. Readings are in units of their sensor's noise; ``together`` makes
-    such tables, and ``Calibration.of(tip)`` is what was found of one chain, as if it
-    had been alone, in its own units.
+    columns. Readings are in units of their sensor's noise, as ``together`` makes them;
+    ``Calibration.of(tip)`` is what was found of one chain, in its own units.
 
     Attributes:
         tips: names of the chains, two or more.
@@ -59,8 +59,8 @@ class Chains(Model):
         """The model of chains by the names of their tips.
 
         Raises:
-            ValueError: there are fewer than two; a joint is in two of them and they do
-                not begin alike up to it.
+            ValueError: there are fewer than two, or a joint is in two that differ
+                before it.
         """
         tips, arms = tuple(chains), tuple(chains.values())
         if len(arms) < 2 or not all(isinstance(arm, SerialChain) for arm in arms):
@@ -95,27 +95,25 @@ class Chains(Model):
 
         Args:
             path: the file.
-            sensors: what each tip link is measured with; one object for two tips
-                stands once.
-            base, locked, limits: as of ``SerialChain.from_urdf``; each chain takes
-                the joints that it has.
+            sensors: of each tip link; one object for two tips stands once.
+            base, locked, limits: as of ``SerialChain.from_urdf``, of joints of any
+                chain.
         """
 
-        def chain(tip: str, **options: Any) -> SerialChain:
-            return SerialChain.from_urdf(
-                path, base=base, tip=tip, sensor=sensors[tip], locked=locked, **options
+        arms = {}
+        for tip, sensor in sensors.items():
+            arm = SerialChain.from_urdf(
+                path, base=base, tip=tip, sensor=sensor, locked=locked
             )
-
-        arms = {tip: chain(tip) for tip in sensors}
-        stiff = cls.of(arms)._shared
-        for (tip, arm), shared in zip(arms.items(), stiff, strict=True):
-            of_arm = {n: v for n, v in (limits or {}).items() if n in arm.joint_names}
-            yielding = tuple(i for i in arm.compliance if i > shared)
-            if of_arm or yielding != arm.compliance:
-                arms[tip] = chain(tip, limits=of_arm, compliance=yielding)
-        return cls.of(arms)
-
-    # -- what the chains share ---------------------------------------------------------
+            names = (limits or {}).keys() & {*arm.joint_names}
+            arms[tip] = arm._limited({name: (limits or {})[name] for name in names})
+        model = cls.of(arms)
+        chains = []
+        for arm, shared in zip(model.chains, model._shared, strict=True):
+            bending = tuple(i for i in arm.compliance if i > shared)
+            yields = np.zeros(len(bending))
+            chains.append(dataclasses.replace(arm, compliance=bending, yields=yields))
+        return dataclasses.replace(model, chains=tuple(chains))
 
     @functools.cached_property
     def _shared(self) -> tuple[int, ...]:
@@ -223,8 +221,6 @@ class Chains(Model):
         arm = self.chains[k]
         return arm.sensor.stds(arm.length or 1.0)
 
-    # -- the model ---------------------------------------------------------------------
-
     @functools.cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Columns of the joints, chain after chain."""
@@ -237,22 +233,18 @@ class Chains(Model):
 
     @property
     def num_inputs(self) -> int:
-        """n."""
         return len(self.inputs)
 
     @property
     def num_outputs(self) -> int:
-        """q, of the sensor that reads most."""
         return max(arm.num_outputs for arm in self.chains)
 
     @property
     def nominal(self) -> Array:
-        """(p,)."""
         return np.asarray(self._gather([arm.nominal for arm in self.chains]))
 
     @property
     def units(self) -> tuple[str, ...]:
-        """p units, as of ``SerialChain``."""
         units = [np.array(arm.units, dtype=object) for arm in self.chains]
         return tuple(self._gather(units))
 
@@ -270,13 +262,11 @@ class Chains(Model):
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        """(N, q, p)."""
         return self._slopes("jacobian", commands, parameters, self.members)
 
     def command_jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        """(N, q, n)."""
         return self._slopes("command_jacobian", commands, parameters, self._columns)
 
     def _slopes(
@@ -337,17 +327,14 @@ class Chains(Model):
                 rows[-1][:, columns] = slopes
         return np.concatenate(offs), np.concatenate(rows)
 
-    # -- what is known before measuring ------------------------------------------------
-
     def default_noise(self) -> Noise:
-        """1: readings are in noise."""
         return Noise(std=1.0)
 
     def default_prior(self) -> Prior:
         """Prior of each chain; held is what no chain that has it sees.
 
         Where arms with bases of their own touch the same sockets, the first one's base
-        is held and the others' are found; of it too what another's sensor shows.
+        is held, but for what another's sensor shows, and the others' are found.
         """
         priors = [arm.default_prior() for arm in self.chains]
         fixed = [set(prior.fixed) for prior in priors]
@@ -373,10 +360,8 @@ class Chains(Model):
         return np.asarray(self._gather(sizes))
 
     def error_groups(self) -> ErrorGroups:
-        """Groups as of ``SerialChain``, of each chain; of harmonics one for all, last.
-
-        What chains share is in the first one's.
-        """
+        """Groups as of ``SerialChain`` of each chain, of harmonics one for all, last;
+        what chains share is in the first one's."""
         of_chains = [arm.error_groups() for arm in self.chains]
         count = len(of_chains[0].medians) - 1
         last = count * len(of_chains)
@@ -423,35 +408,21 @@ class Chains(Model):
             return self
         return dataclasses.replace(self, chains=arms)
 
-    # -- the commands and readings of a fit or a choice --------------------------------
-
     def together(
         self, tables: Mapping[str, tuple[ArrayLike, ArrayLike | None]]
     ) -> tuple[Array, Array]:
-        """Commands and readings of all chains as the tables that a fit takes.
+        """Commands (N, n) and readings (N, q) in noise of all chains, for a fit.
 
         Args:
-            tables: by tip a pair: commands (N, n) of that chain with its sensor's
-                columns, and what it measured (N, q), or None for zeros (contacts) and
-                for candidates.
-
-        Returns:
-            Commands (N, n) and readings (N, q) in noise.
+            tables: by tip a pair: commands of that chain with its sensor's columns, and
+                what it measured, or None for zeros (contacts) and candidates.
         """
-        all_commands, all_measured = [], []
-        for tip, (raw_commands, readings) in tables.items():
+        named = []
+        for tip, table in tables.items():
             k = self.tips.index(one_of("tip", tip, self.tips))
-            columns = self._columns[k]
-            arm_commands = array_of(
-                f"commands of {tip}", raw_commands, "N", len(columns)
-            )
-            commands = np.zeros((len(arm_commands), self.num_inputs))
-            commands[:, len(self.joint_names)] = k
-            commands[:, columns] = arm_commands
-            all_commands.append(commands)
-            count, noise = len(arm_commands), self._scale(k)
-            all_measured.append(in_noise(tip, readings, count, noise, self.num_outputs))
-        return np.vstack(all_commands), np.vstack(all_measured)
+            named.append(OneTable(tip, k, self._columns[k], self._scale(k), *table))
+        label, q = len(self.joint_names), self.num_outputs
+        return stacked(named, label, self.num_inputs, q)
 
     def require_commands(self, commands: Array) -> None:
         for k, arm, _, arm_commands in self._parts(commands):
@@ -462,8 +433,7 @@ class Chains(Model):
         """These chains with their sensors where commands (and readings) put them.
 
         Raises:
-            ValueError: as of ``SerialChain.prepared``; a socket whose distance is given
-                is touched by no chain.
+            ValueError: as of an arm; no chain touches a socket whose distance is given.
         """
         tables = []
         for k, arm, rows, arm_commands in self._parts(commands):
@@ -472,7 +442,7 @@ class Chains(Model):
                 read = measured[rows, : arm.num_outputs] * self._scale(k)
             tables.append((k, arm_commands, read))
             with self._naming(k):
-                self.chains[k].require_readings(arm_commands, read)
+                require_readings(self.chains[k], arm_commands, read)
         arms = self._located(tables)
         if measured is not None:
             for readings in self._by_member(arms, tables).values():
@@ -480,7 +450,7 @@ class Chains(Model):
                 require_touched(readings[0].sensor, np.vstack(columns))
         for k, arm_commands, read in tables:
             with self._naming(k):
-                arms[k].require_places(arm_commands, read)
+                require_places(arms[k], arm_commands, read)
         return dataclasses.replace(self, chains=tuple(arms))
 
     @contextlib.contextmanager
@@ -583,8 +553,6 @@ class Chains(Model):
         )
         return tuple(dict.fromkeys(names))
 
-    # -- a calibrated machine ----------------------------------------------------------
-
     def of_chain(self, fit: Any, tip: str) -> dict[str, Any]:
         """The fields of a calibration that are of one chain, in its own units."""
         k = self.tips.index(one_of("tip", tip, self.tips))
@@ -629,12 +597,8 @@ class Chains(Model):
         return dataclasses.replace(self, chains=tuple(chains))
 
     def _shared_parts(self, fit: Any) -> list[Any]:
-        """What chains read of the sensors that they share, of all rows that are used.
-
-        Distances that one chain's contacts judge are left to its own verdict.
-        """
-        from jaxcal.arms.findings import Part
-
+        """What chains read of the sensors that they share, of all rows that are used;
+        distances that one chain's contacts judge are left to its own verdict."""
         used = np.flatnonzero(fit.loss_weights > 0.0)
         tables = [(k, at, None) for k, _, _, at in self._parts(fit.commands[used])]
         parts = []
@@ -659,8 +623,6 @@ class Chains(Model):
 
     def verdict(self, fit: Any) -> ChainsVerdict:
         """Good where every chain that was read is, and distances that they share."""
-        from jaxcal.arms.findings import CLEAR_UP, other_distances
-
         used = fit.commands[fit.loss_weights > 0.0]
         read = {self.tips[k] for k, *_ in self._parts(used)}
         of_chains = {tip: fit.of(tip).verdict for tip in self.tips if tip in read}
@@ -699,11 +661,8 @@ class Chains(Model):
         *,
         force: bool = False,
     ) -> str:
-        """Write the URDF file that all chains came from, every chain corrected.
-
-        Returns:
-            The tip links, with a comma between.
-        """
+        """Write the URDF file that all chains came from, every chain corrected; the tip
+        links, with a comma between."""
         from jaxcal.arms.files.write import urdf_text
 
         one_of("form", form, ("urdf",))
@@ -713,7 +672,6 @@ class Chains(Model):
         return ", ".join(tips)
 
     def to_dict(self) -> dict[str, Any]:
-        """What a file holds of the model."""
         arms = [arm.to_dict() for arm in self.chains]
         stands = [list(numbers) for numbers in self.stands]
         return {"kind": "chains", "tips": self.tips, "chains": arms, "stands": stands}

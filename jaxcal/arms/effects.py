@@ -1,8 +1,7 @@
 """What else an arm does than its description says, chosen by held-out readings.
 
-Where the noise does not explain the scatter: wider tolerances, joints that yield, gears
-and their harmonics are fitted too, and what helps most with readings that were left out
-is kept. Play is looked for, and said.
+Where the noise does not explain the scatter, wider tolerances, compliance, gears and
+harmonics are fitted too; what helps most is kept. Play is looked for, and said.
 """
 
 from __future__ import annotations
@@ -13,12 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.arms.chain import SerialChain as Chain
+from jaxcal.arms.chain import turning
 from jaxcal.calibration.verdict import left_out
 from jaxcal.checks import Array
 from jaxcal.models.uncertainty import Prior
 
 if TYPE_CHECKING:
-    from jaxcal.arms.chain import SerialChain as Chain
     from jaxcal.arms.verdict import ArmFit as Fit
 
 
@@ -37,19 +37,17 @@ _SURE = 3.0  # standard errors of a play
 
 
 def scatter(fit: Fit) -> float:
-    """Noise that was found, as a multiple of the sensor's usual one."""
+    """Noise that was found, by the sensor's usual one."""
     usual = np.asarray(fit.model.default_noise().std)
     return float(np.sqrt(np.mean((np.asarray(fit.noise_std) / usual) ** 2)))
 
 
-def chosen(fit: Fit) -> Fit:
+def improved(model: Chain, fit: Fit) -> Fit:
     """The calibration, or one with the effects that held-out readings ask for.
 
     Left as it is: of a noise or prior that was stated, a scatter that the noise
-    explains, contacts at few places, a table that is mispaired, and fewer than 12
-    measurements.
+    explains, contacts at few places, a mispaired table, and fewer than 12 measurements.
     """
-    model = fit.model
     stated = fit.noise_std is None or fit.noise_known or "prior" in fit.provenance
     few = fit.num_measurements < max(_ENOUGH, len(model.joint_names) + 6)
     if stated or few or not model.fits_misfit or scatter(fit) < SCATTER:
@@ -98,9 +96,9 @@ def _held_out(fit: Fit) -> Array:
 def _alternatives(model: Chain) -> Iterator[tuple[str, Chain, Prior]]:
     """Effects in words, the arm with them, and its prior."""
     more = {
-        "compliance": model.compliance or model._turning,
+        "compliance": model.compliance or turning(model.joints),
         "gears": model.gears or range(1, len(model.joints) + 1),
-        "harmonics": model._turning,
+        "harmonics": turning(model.joints),
     }
     for names in (
         (),
@@ -146,10 +144,8 @@ def in_words(fit: Fit, unit: str) -> list[str]:
 
 
 def play_in_words(fit: Fit, unit: str) -> list[str]:
-    """Joints whose residuals follow the side that they came from, as a sentence.
-
-    Rows are taken to be in the order of measuring.
-    """
+    """Joints whose residuals follow the side that they came from, rows being in the
+    order of measuring."""
     model, commands = fit.model, fit.commands
     zeros = [name for name in model.slips if name.startswith("theta")]
     at = [model.names.index(name) for name in zeros]
@@ -185,13 +181,12 @@ def play_in_words(fit: Fit, unit: str) -> list[str]:
     ]
 
 
-def unexplained(fit: Fit, rows: Array) -> Array:
+def unexplained(model: Chain, fit: Fit, rows: Array) -> Array:
     """(N, q) standard deviations of an arm's predictions at commands ``rows`` (N, n).
 
-    A noise that was estimated and is more than three times the sensor's usual one is
-    taken for errors of the arm, which its predictions have too; where postures were
-    repeated, what these scatter by is noise. It grows with how far a joint is beyond
-    the range that was measured.
+    An estimated noise above three times the sensor's usual one is taken for errors of
+    the arm, but for what repeated postures scatter by. It grows with how far a joint is
+    beyond the range that was measured.
     """
     if fit.noise_std is None or fit.noise_known or scatter(fit) < SCATTER:
         return np.zeros((len(rows), fit.num_outputs))
@@ -199,10 +194,10 @@ def unexplained(fit: Fit, rows: Array) -> Array:
     columns, used = fit.model.num_joints, fit.loss_weights > 0.0
     measured = fit.commands[used, :columns]
     low, high = measured.min(axis=0), measured.max(axis=0)
-    turning = np.array(fit.model.command_units) == "deg"
-    width = np.maximum(
-        high - low, np.where(turning, _NARROW, _SHORT * fit.model.length)
+    least = np.where(
+        np.array(model.command_units) == "deg", _NARROW, _SHORT * model.length
     )
+    width = np.maximum(high - low, least)
     joints = rows[:, :columns]
     beyond = np.maximum(low - joints, joints - high).clip(0.0) / width
     times = 1.0 + (_BEYOND * np.linalg.norm(beyond, axis=1)) ** 2

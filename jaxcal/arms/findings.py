@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.sensors import Sensor, Socket, Wrench
 from jaxcal.calibration.verdict import Reason, outlying
 from jaxcal.checks import Array
 
 if TYPE_CHECKING:
-    from jaxcal.arms.chain import SerialChain as Chain
     from jaxcal.arms.verdict import ArmFit as Fit
 
 
@@ -38,10 +38,7 @@ _SHOWN = 0.5  # of the prior's variance: less was removed, readings hardly show 
 
 
 class Part(NamedTuple):
-    """What one sensor of an arm read: of ``Several`` each, else the only one.
-
-    Or of arms that share it.
-    """
+    """What one sensor of an arm, or of arms that share it, read."""
 
     member: int  # number of it
     sensor: Sensor
@@ -123,8 +120,8 @@ def findings_of(
     """What is wrong, by name, of the rows ``used`` (K,).
 
     ``scatter`` is what the noise does not explain, ``mistaken`` what was said of
-    columns that are reversed or exchanged, ``anywhere`` the tip's standard deviation,
-    ``nominal`` its error by the arm as described.
+    columns, ``anywhere`` the tip's standard deviation, ``nominal`` its error as
+    described.
     """
     model = calibration.model
     swapped: dict[int, int] = {}
@@ -178,11 +175,8 @@ def findings_of(
 def left_open(
     parts: list[Part], unit: str, anywhere: float, nominal: float
 ) -> Reason | None:
-    """The readings leave the arm open, where they do.
-
-    Of contacts the size: an arm a tenth smaller, its sockets nearer together, touches
-    them as well.
-    """
+    """The readings leave the arm open, where they do: of contacts the size, since a
+    smaller arm touches nearer sockets as well."""
     sockets = [part for part in parts if isinstance(part.sensor, Socket)]
     sized = any(part.touched().any() for part in sockets)
     if sized or not anywhere > _VAGUE * nominal:
@@ -239,7 +233,7 @@ def _far(calibration: Fit) -> list[str]:
 
 
 def _kept(calibration: Fit) -> list[str]:
-    """Shifts of the tool that contacts do not show, as a sentence."""
+    """Shifts of the tool that contacts do not show."""
     sensor, names = calibration.model.sensor.members[0], calibration.names
     if not sensor.zeros or sensor.views:
         return []
@@ -254,11 +248,8 @@ def _kept(calibration: Fit) -> list[str]:
 
 
 def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
-    """A tip far from where the arm's description has it, and whether that is in doubt.
-
-    In doubt is one that is farther off than the prior allowed. Else the description is
-    wrong, or of another tool, and what the readings leave unknown is in the intervals.
-    """
+    """A tip far from where the arm's description has it, and whether that is in doubt:
+    it is farther off than the prior allowed."""
     if not model.sensor.members[0].zeros:  # the others' places on the tool are loose
         return [], False
     names = calibration.names
@@ -284,7 +275,7 @@ def other_distances(
 ) -> tuple[list[str], bool]:
     """Distances that were given and that the contacts contradict; by much or not.
 
-    One that seems so, to first order, is freed: the readings are fitted without it.
+    Each that seems so, to first order, is freed: the readings are fitted without it.
     """
     said, most, unit = [], 0.0, unit_after(calibration)
     for part in parts:
@@ -343,11 +334,8 @@ def _freed(calibration: Fit, part: Part, row: int) -> tuple[float, float]:
 
 
 def _at_these_sizes(calibration: Fit, facts: Array) -> Array:
-    """(p, p) covariance of the parameters, the sizes of the arm's errors held.
-
-    That of the calibration counts what is not known of the sizes, and is no longer what
-    the readings and ``facts`` (F, p) add up to.
-    """
+    """(p, p) covariance of the parameters by the readings and ``facts`` (F, p) alone,
+    the sizes of the arm's errors held."""
     used = np.flatnonzero(calibration.loss_weights > 0.0)
     theta = calibration.parameters
     slopes = np.asarray(calibration.model.jacobian(calibration.commands[used], theta))
@@ -367,7 +355,7 @@ def _at_these_sizes(calibration: Fit, facts: Array) -> Array:
 
 
 def _still(model: Chain, commands: Array) -> tuple[list[str], bool]:
-    """Joints' columns that never change, and whether one may not be recorded."""
+    """Columns that never change, and whether one may not be recorded."""
     joints = commands[:, : model.num_joints]
     if len(joints) < _STILL:
         return [], False

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.sensors import Board, Sensor, Socket
 from jaxcal.arms.views import seen_by
 from jaxcal.checks import Array, in_words
 
-if TYPE_CHECKING:
-    from jaxcal.arms.chain import SerialChain as Chain
-
-
+_BEYOND_TURNS = 20.0  # degrees: as radians, more turns than a joint makes
+_BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
 _OTHER_ARM = "wrong tip, unit, sign or order of columns, or rows of another place?"
 
 _NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
@@ -27,11 +26,97 @@ _EXPLAINED = 0.2  # of the errors as given: what is left when the mistake is und
 _OTHER_UNIT = 0.01  # of it: so far off and tenfold, a distance is in another unit
 
 
-def require_readings(arm: Chain, commands: Array, measured: Array) -> None:
-    """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold.
+def prepared(arm: Chain, commands: Array, measured: Array | None = None) -> Chain:
+    """The arm with its sensor where commands (and readings) put it.
 
-    Of a camera whose picture is known, corners outside of it.
+    Raises:
+        ValueError: readings in another unit, of another arm or place, radians for
+            degrees, joints beyond their limits.
     """
+    require_readings(arm, commands, measured)
+    arm = arm.located(commands, measured)
+    if measured is not None:
+        tip, inputs = arm.nominal_tip(commands), commands[:, arm.num_joints :]
+        for part in arm.sensor.of_members(tip, inputs, measured):
+            require_touched(part.sensor, part.columns)
+    require_places(arm, commands, measured)
+    return arm
+
+
+def require_readings(arm: Chain, commands: Array, measured: Array | None) -> None:
+    """Refuse what no arm like this one takes or gives; None, candidates."""
+    if measured is not None:
+        for part in arm.of_each_sensor(commands, measured):
+            _require_of_sensor(*part)
+    arm.require_commands(commands)
+    if measured is None:
+        _warn_of_radians(arm, commands)
+
+
+def require_places(arm: Chain, commands: Array, measured: Array | None) -> None:
+    """Refuse contacts of other places; warn of views without the board."""
+    if measured is None:
+        _warn_of_picture(arm, commands)
+        return
+    for part in arm.of_each_sensor(commands, measured):
+        _require_sockets(*part)
+
+
+def require_commands(arm: Chain, commands: Array) -> None:
+    """Refuse radians for degrees, and joints far beyond their limits."""
+    low, high = arm.limits.T
+    turning = np.array(arm.command_units) == "deg"
+    joints, inputs = np.split(commands, [arm.num_joints], axis=1)
+    for _, one, rows, _ in arm.sensor.parts(inputs):
+        largest = np.abs(joints[rows][:, turning]).max(initial=0.0)
+        small = arm.num_joints > 2 and 1.0 < largest < 7.0
+        if small and not one.positions:  # readings tell of these
+            raise ValueError(
+                f"commands must be in degrees, but no angle exceeds {largest:.3g}: "
+                "are they radians? Use np.degrees(commands), --radians"
+            )
+    largest = np.abs(joints[:, turning]).max(initial=0.0)
+    if largest > np.degrees(_BEYOND_TURNS) and arm.num_joints > 2:
+        raise ValueError(
+            f"commands must be in degrees, but angles reach {largest:.6g}: were "
+            "degrees converted as if they were radians? Leave out np.degrees, --radians"
+        )
+    slack = np.where(turning, _BEYOND, 0.01 * _BEYOND * (high - low))
+    far = np.argwhere((joints < low - slack) | (joints > high + slack))
+    for row, joint in far[:1]:
+        name, column = arm.joint_names[joint], joints[:, joint]
+        least, most = (low - slack)[joint], (high + slack)[joint]
+        around = np.where(column > 180.0, column - 360.0, column)
+        if turning[joint] and column.max() >= 0.0 and _within(around, least, most):
+            advice = (
+                f"{name} seems to be read in 0 to 360: subtract 360 from what is above "
+                "180."
+            )
+        elif _within(-column, least, most):
+            advice = (
+                f"{name} seems reversed: with the other sign all rows are within the "
+                "limits. Negate that column."
+            )
+        elif len(column) > 1 and not np.ptp(column):
+            advice = f"it is the same in all {len(column)} rows: was it recorded?"
+        else:
+            order = ", ".join(arm.joint_names)
+            advice = f"are the columns in this order: {order}?"
+        raise ValueError(
+            f"row {row}: {name} = {joints[row, joint]:g} is outside its limits "
+            f"({low[joint]:g} to {high[joint]:g}) by more than {slack[joint]:g}; "
+            f"{advice} If the file's limits are wrong, give "
+            f"limits={{name: (low, high)}}, --limits"
+        )
+
+
+def _within(column: Array, least: float, most: float) -> bool:
+    return bool(((column >= least) & (column <= most)).all())
+
+
+def _require_of_sensor(arm: Chain, commands: Array, measured: Array) -> None:
+    """Refuse millimetres for metres, radians for degrees (no arm is off tenfold), and a
+    board's corners outside of the picture."""
     joints = commands[:, : arm.num_joints]
     if len(joints) > 2 and (joints == joints[0]).all():
         raise ValueError(
@@ -74,8 +159,6 @@ def _require_tool(arm: Chain, commands: Array, poses: Array) -> None:
 
 def _mean_turn(turns: Array) -> tuple[Array, float]:
     """Mean of rotations (N, 3, 3) as a vector in degrees, and their median from it."""
-    from scipy.spatial.transform import Rotation
-
     whole = Rotation.from_matrix(turns)
     mean = whole.mean()
     apart = np.degrees((mean.inv() * whole).magnitude())
@@ -99,7 +182,7 @@ def _require_in_picture(board: Board, pixels: Array, length: float) -> None:
         )
 
 
-def warn_of_picture(arm: Chain, candidates: Array) -> None:
+def _warn_of_picture(arm: Chain, candidates: Array) -> None:
     """Warn of candidates from which a camera does not have the whole board in view."""
     board = arm.sensor
     if not isinstance(board, Board) or board.corners is None:
@@ -119,7 +202,7 @@ def warn_of_picture(arm: Chain, candidates: Array) -> None:
         )
 
 
-def require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
+def _require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
     """Refuse contacts that no arm near the nominal one can have made."""
     if not isinstance(arm.sensor, Socket):
         return
@@ -179,7 +262,7 @@ def require_touched(sensor: Sensor, inputs: Array) -> None:
         )
 
 
-def warn_of_radians(arm: Chain, candidates: Array) -> None:
+def _warn_of_radians(arm: Chain, candidates: Array) -> None:
     """Postures of an arm that all lie within one turn, had they been radians."""
     turning = np.array(arm.command_units) == "deg"
     largest = np.abs(candidates[:, : arm.num_joints][:, turning]).max(initial=0.0)
@@ -194,9 +277,8 @@ def warn_of_radians(arm: Chain, candidates: Array) -> None:
 def mistaken_columns(arm: Chain, commands: Array, measured: Array) -> str:
     """Which joints' columns are reversed or exchanged, as a sentence; "" of none.
 
-    Undone on the arm as described, one or two joints reversed or two exchanged, it
-    must leave a fifth of the errors, and the least of all of these. A joint that the
-    sensor does not see turn (the last, with the tip on its axis) is not told.
+    Undone on the arm as described, one or two joints reversed or two exchanged, it must
+    leave a fifth of the errors, and the least of all of these.
     """
     turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
     pairs = [*itertools.combinations(turning, 2)]

@@ -5,25 +5,16 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.sensors import Board, Plane, Socket
-from jaxcal.arms.views import (
-    aimed,
-    distances,
-    in_picture,
-    in_view,
-    towards_zero,
-    view_of,
-)
+from jaxcal.arms.views import aimed, in_picture, in_view, towards_zero, view_of
 from jaxcal.checks import Array, in_words, numbers, whole_number
-
-if TYPE_CHECKING:
-    from jaxcal.arms.chain import SerialChain as Chain
-
+from jaxcal.models.model import as_commands
 
 _ROUNDS = 40  # batches of starts
 _BATCH = 2_000  # starts at a time, where few are any good
@@ -43,17 +34,6 @@ class Room:
     planes: Array  # (P, 4) normal, offset: spheres stay where normal . x > offset
     boxes: Array  # (B, 6) least x, y, z, then greatest: spheres stay outside
     radius: float | None  # of the spheres
-
-    def require_sockets(self, arm: Chain) -> None:
-        """Refuse sockets that are below the floor."""
-        places = arm.sensor.places if isinstance(arm.sensor, Socket) else None
-        if self.floor is None or places is None:
-            return
-        for i in np.flatnonzero(places[:, 2] < self.floor - _SUNK * arm.length)[:1]:
-            raise ValueError(
-                f"socket {i} at {in_words(places[i])} is below floor = {self.floor:g}: "
-                "is the floor's height given in the frame of the base?"
-            )
 
     def reasons(self, arm: Chain, commands: Array) -> Array:
         """(N,) why a posture is not possible, "" where it is."""
@@ -99,6 +79,8 @@ def _room_of(
     """Checked; the cone of an approach without its angle is 60 degrees."""
     if radius is not None and not len(clear):
         raise ValueError(f"radius needs clear= (planes or boxes), got {radius}")
+    if floor is not None:
+        numbers("floor", floor)
     if radius is not None and not numbers("radius", radius) > 0.0:
         raise ValueError(f"radius must be positive, got {radius}")
     if floor is None and approach is None and not len(clear):
@@ -126,12 +108,77 @@ def _room_of(
     for row in things[4]:
         row /= np.linalg.norm(row[:3])
     planes, boxes = (np.array(rows).reshape(-1, n) for n, rows in things.items())
-    height = None if floor is None else float(numbers("floor", floor))
-    return Room(height, cone, planes, boxes, radius)
+    return Room(floor, cone, planes, boxes, radius)
+
+
+def postures(arm: Chain, count: int, *, seed: int = 0, **rules: Any) -> Array:
+    """Postures that can be measured, to choose from.
+
+    Within the limits (180 degrees where a file has none), two degrees apart at least,
+    with the ball in the socket, the probe on the plane or the board in view: inverse
+    kinematics from random starts, a redundant arm's self-motions among them.
+
+    Args:
+        arm: with its sensor.
+        count: how many.
+        seed: of the random starts.
+        near: rough places: (S, 3) sockets or (S, 4) planes if the sensor has no places;
+            for a sensor that reads everywhere rows (x, y, z, radius), of which the tip
+            must be near one; not for a board.
+        allowed: function of joints (J,), False where they collide.
+        camera: of a board, (width, height, fx, fy, cx, cy) in pixels, or a field of
+            view in degrees (horizontal, vertical): every corner is in the picture, with
+            a focal length that is known to a tenth.
+        distance: least and greatest, of the board's middle from that camera; by default
+            the board fills 25 to 80 % of the picture.
+        tilt: degrees that the board's face may be turned from the camera, by default
+            45.
+        side: "+z", the printed side is where the board's z axis points, or "-z"; by
+            default as views showed it, else either.
+        floor: lowest height (z in the measuring frame) of joints, and of sockets within
+            1 % of the arm's length.
+        approach: direction (x, y, z) of the tool's approach, from the last joint to the
+            tip, and the largest angle from it in degrees (60).
+        clear: planes (normal, offset) whose other side, and boxes (least x, y, z,
+            greatest), that the arm does not touch: spheres along straight lines between
+            the joints. The first link, the tip and the arm against itself are not
+            looked at.
+        radius: of these spheres; by default 4 % of the arm's length.
+
+    Returns:
+        (count, n) commands with the sensor's columns, in an order of little travel.
+
+    Raises:
+        ValueError: there are fewer, or a socket cannot be reached; with the reasons.
+    """
+    return reachable(arm, **rules).drawn(count, seed)
+
+
+def reachable(arm: Chain, **rules: Any) -> ReachableSet:
+    """Where the arm can be measured: ``allowed`` of ``Design.refine``.
+
+    Arguments as of ``postures``, from ``near`` on. Commands that a search tries are
+    moved to where the sensor reads.
+    """
+    return ReachableSet(arm, **rules)
+
+
+def in_turn(arm: Chain, commands: ArrayLike) -> NDArray[np.int64]:
+    """(N,) the commands' rows in an order of little travel, socket after socket."""
+    rows, joints = as_commands(arm, commands), arm.num_joints
+    order: list[int] = []
+    remaining = list(range(len(rows)))
+    while remaining:
+        last = rows[order[-1]] if order else rows[remaining[0]]
+        other = (rows[remaining, joints:] != last[joints:]).any(axis=1)
+        other &= rows.shape[1] - joints == 1
+        far = np.abs(rows[remaining, :joints] - last[:joints]).max(axis=1)
+        order.append(remaining.pop(int(np.lexsort((far, other))[0])))
+    return np.array(order)
 
 
 class ReachableSet:
-    """Where an arm can be measured; arguments as of ``SerialChain.postures``."""
+    """Where an arm can be measured; arguments as of ``postures``."""
 
     def __init__(
         self,
@@ -150,17 +197,19 @@ class ReachableSet:
     ) -> None:
         if camera is None and getattr(arm.sensor, "picture", None) is not None:
             camera = arm.sensor.camera  # type: ignore[attr-defined]  # of a Board
-        self.view = view_of(camera, distance, tilt, side)
+        self.view = view_of(arm, camera, distance, tilt, side)
         self.room = _room_of(floor, approach, clear, radius)
-        if self.view is not None and not arm.sensor.views:
-            raise ValueError("camera needs an arm with sensor=Board(...)")
         if arm.sensor.joined:
             raise ValueError("use one sensor at a time: arm.measured_with(sensor)")
         self.near, self.allowed = near, allowed
         self.arm, self.targets = _aimed(arm, near)
-        if self.room is not None:
-            self.room.require_sockets(self.arm)
-        self.ends = (0.0, 0.0) if self.view is None else distances(self.arm, self.view)
+        places = getattr(self.arm.sensor, "places", None)
+        if floor is not None and isinstance(arm.sensor, Socket) and places is not None:
+            for i in np.flatnonzero(places[:, 2] < floor - _SUNK * arm.length)[:1]:
+                raise ValueError(
+                    f"socket {i} at {in_words(places[i])} is below floor = {floor:g}: "
+                    "is the floor's height given in the frame of the base?"
+                )
         self.turning = np.array(self.arm.command_units) == "deg"
 
     @property
@@ -197,8 +246,8 @@ class ReachableSet:
         reasons = [""] * len(commands)
         if self.view is not None:
             if rng is not None:
-                commands = aimed(arm, commands, low, high, self.view, self.ends, rng)
-            commands, reasons = in_picture(arm, commands, self.view, self.ends)
+                commands = aimed(arm, commands, low, high, self.view, rng)
+            commands, reasons = in_picture(arm, commands, self.view)
         elif arm.sensor.views:
             commands, reasons = in_view(arm, commands)
         elif arm.sensor.zeros:
@@ -231,7 +280,7 @@ class ReachableSet:
             for one in zip(*self.reach(commands, rng), places, strict=True):
                 collection.add(*one)
             if len(collection.kept) == count and collection.reached.all():
-                return collection.kept[in_turn(collection.kept, self.arm.num_joints)]
+                return collection.kept[in_turn(self.arm, collection.kept)]
         raise ValueError(collection.shortfall())
 
 
@@ -263,8 +312,7 @@ class _Collection:
         return np.hstack([joints, labels]), places
 
     def add(self, command: Array, reason: str, place: int) -> None:
-        """Keep a command for a place, unless a ``reason`` against it is given or found:
-        another is near, or it is not allowed."""
+        """Keep a command for a place, unless there is a ``reason`` against it."""
         joints = command[: self.arm.num_joints]
         if len(self.kept) == self.count and self.reached[place]:
             return  # enough; of the other places one posture is looked for
@@ -285,12 +333,9 @@ class _Collection:
         """What is missing: a place that no posture reaches, or postures."""
         missed = np.flatnonzero(self.reached == 0)
         if len(self.reached) > 1 and len(missed):
-            place = missed[0]
-            where = ""
+            place, refused = missed[0], self.refused[missed[0]]
             places = getattr(self.arm.sensor, "places", None)
-            if places is not None:
-                where = f" at {in_words(places[place])}"
-            refused = self.refused[place]
+            where = "" if places is None else f" at {in_words(places[place])}"
             return (
                 f"no posture reaches {self.arm.sensor.kind} {place}{where}: of "
                 f"{refused.total()} postures tried {_counted(refused)}"
@@ -342,17 +387,3 @@ def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:
             f"{places.shape[1]} columns"
         )
     return arm, places
-
-
-def in_turn(postures: Array, joints: int) -> NDArray[np.int64]:
-    """Socket after socket, and in each the nearest posture next: rows in that order."""
-    order: list[int] = []
-    remaining = list(range(len(postures)))
-    while remaining:
-        last = postures[order[-1]] if order else postures[remaining[0]]
-        other = (postures[remaining, joints:] != last[joints:]).any(axis=1)
-        other &= postures.shape[1] - joints == 1
-        far = np.abs(postures[remaining, :joints] - last[:joints]).max(axis=1)
-        nearest = int(np.lexsort((far, other))[0])
-        order.append(remaining.pop(nearest))
-    return np.array(order)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
 from jaxcal.arms.findings import (
     MORE,
@@ -38,7 +39,6 @@ from jaxcal.checks import Array
 from jaxcal.information.singular import depends, significant
 
 if TYPE_CHECKING:
-    from jaxcal.arms.chain import SerialChain as Chain
     from jaxcal.calibration import Calibration
 
     class ArmFit(Calibration):
@@ -86,9 +86,9 @@ class ArmVerdict(models.Verdict):
     """What the readings say of an arm's calibration.
 
     Good: held-out errors are below the accuracy asked for. Where none was, it is better
-    than the nominal machine, and the noise explains the scatter or what is left is a
-    third of the nominal error; of an accurate arm with a camera or a board, the place
-    of that is known. In each case no reading contradicts the others or the arm's
+    than the nominal machine, and the noise explains the scatter or a third of the
+    nominal error is left; of an accurate arm with a camera or a board, the place of
+    that is known. In each case no reading contradicts the others or the arm's
     description, and contacts do not leave its size open.
     """
 
@@ -162,15 +162,13 @@ def _missed(
     return [one for one in errors if one.interval[1] > asked.get(one.unit, np.inf)]
 
 
-def verdict(calibration: ArmFit) -> ArmVerdict:
+def verdict(model: Chain, calibration: ArmFit) -> ArmVerdict:
     """Does its model explain the readings, does it help, what is wrong.
 
     Held-out errors with an interval beside those of the nominal arm, the scatter
-    against the sensor's usual noise, and by name: outliers, contacts of another socket,
-    a socket that was moved, a distance that contacts contradict, joints reversed or
-    exchanged, parameters far from what was known.
+    against the sensor's usual noise, and by name what ``findings_of`` finds.
     """
-    model, unit = calibration.model, calibration.measured_unit
+    unit = calibration.measured_unit
     usual, reason = np.asarray(model.default_noise().std), None
     if calibration.noise_std is None:
         stds = np.broadcast_to(usual, (calibration.num_outputs,))
@@ -270,7 +268,7 @@ def place_of(calibration: ArmFit, names: Sequence[str]) -> Place:
     """How well six shifts and turns are known.
 
     Hidden are those in directions of which the readings leave half of what is usual of
-    a tool: along a SCARA's axes, and all shifts of a gantry, whose tool never turns.
+    a tool: along a SCARA's axes, and all shifts of a gantry.
     """
     model = calibration.model
     at = np.array([model.names.index(name) for name in names])
@@ -303,10 +301,7 @@ def _sessions(calibration: ArmFit, first: HeldOut) -> str:
 def _next_step(
     findings: Findings, scatter: Reason | None, noise_known: bool, more: bool
 ) -> str:
-    """What to do about a calibration that is not good.
-
-    ``more`` measurements may make it so.
-    """
+    """What to do about a calibration that is not good; ``more`` may help."""
     kind, residuals = findings.moved, scatter.remedy if scatter else _LOOK
     steps = (
         (findings.mistaken, "correct the columns, then identify again"),
@@ -330,15 +325,15 @@ def _next_step(
 
 
 def _ratio(held_out: Array, off: Array) -> tuple[float, float]:
-    """Mean of held-out errors (K, q) by the nominal arm's, and the half-width of its
-    95 % interval; readings of two units in noise."""
+    """Mean of held-out errors (K, q) by the nominal arm's, and half of its 95 %
+    interval."""
     mean, half_width = _mean(np.linalg.norm(held_out, axis=1))
     nominal = float(np.linalg.norm(off, axis=1).mean()) or 1e-300
     return mean / nominal, half_width / nominal
 
 
 def _mean(errors: Array) -> tuple[float, float]:
-    """Mean of errors (K,), and the half-width of its 95 % interval."""
+    """Mean of errors (K,), and half of its 95 % interval."""
     half_width = 1.96 * errors.std() / np.sqrt(max(len(errors) - 1, 1))
     return float(errors.mean()), float(half_width)
 
@@ -394,10 +389,9 @@ def _anywhere(
     calibration: ArmFit, model: Chain, parts: list[Part]
 ) -> tuple[Part, float]:
     """The first part whose readings are positions, and the standard deviation of the
-    tip's position at postures of any kind, in its unit.
+    tip's position at postures of any kind, beside a shift and a turn of the whole arm.
 
-    Beside a shift and a turn of the whole arm, which contacts do not show. NaN where
-    none reads positions, and where nothing determines it.
+    NaN where none reads positions, and where nothing determines it.
     """
     for part in parts:
         if part.sensor.positions or isinstance(part.sensor, Socket):

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
+from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.sensors import Board
 from jaxcal.checks import Array, array_of, in_words, numbers
-
-if TYPE_CHECKING:
-    from jaxcal.arms.chain import SerialChain as Chain
-
 
 _STEPS = 80  # of the inverse kinematics
 _VIEW = np.cos(np.radians(25.0))  # of the board from the camera's axis, and its face
 _FOCAL = 1.12  # times: focal lengths are known to a tenth, and arms are off
 _EDGE = 0.02  # of the picture's width, that the board stays away from its edge
-_FILLED = (0.25, 0.8)  # of the picture's width by the board, where no distance is given
+_FILLED = (0.8, 0.25)  # of the picture's width by the board, where no distance is given
 _TILT = 45.0  # degrees, where none is given
 _SIDES = {"+z": 1.0, "-z": -1.0}
 
@@ -30,12 +28,13 @@ class View:
     """What a camera must see of a board for its picture to be of use."""
 
     camera: Array  # (6,) width, height, fx, fy, cx, cy
-    distance: tuple[float, float] | None  # of the board's middle from the camera
+    ends: tuple[float, float]  # least and greatest, of the board's middle from it
     tilt: float  # degrees, between the board's face and the way to the camera
     side: float  # 1: seen from where the board's z points, -1 from behind, 0 either
 
 
 def view_of(
+    arm: Chain,
     camera: ArrayLike | None,
     distance: Sequence[float] | None,
     tilt: float | None,
@@ -47,6 +46,8 @@ def view_of(
             if value is not None:
                 raise ValueError(f"{name} needs camera= and a board, got {value}")
         return None
+    if not isinstance(arm.sensor, Board):
+        raise ValueError("camera needs an arm with sensor=Board(...)")
     lens = numbers("camera", camera)
     if lens.shape == (2,) and (lens > 0.0).all() and (lens < 180.0).all():
         wide = 2.0 * np.tan(np.radians(lens) / 2.0)
@@ -61,15 +62,22 @@ def view_of(
         raise ValueError(f"tilt must be in (0, 90) degrees, got {tilt}")
     if side is not None and side not in _SIDES:
         raise ValueError(f"side must be '+z' or '-z', got {side!r}")
-    ends = None
-    if distance is not None:
-        low, high = array_of("distance", distance, 2).tolist()
-        if not 0.0 < low < high:
+    if distance is None:
+        points = arm.sensor.outline
+        size = 2.0 * np.linalg.norm(points - points.mean(axis=0), axis=1).max()
+        if not size > 0.0:
             raise ValueError(
-                f"distance must be (least, greatest), positive, got {distance}"
+                "distance is missing: (least, greatest) from the camera to the board; "
+                "Board has neither corners nor extent"
             )
-        ends = (low, high)
-    return View(lens, ends, float(tilt), _SIDES.get(side or "", 0.0))
+        distance = [lens[2] * size / (share * lens[0]) for share in _FILLED]
+    low, high = array_of("distance", distance, 2).tolist()
+    if not 0.0 < low < high:
+        raise ValueError(
+            f"distance must be (least, greatest), positive, got {distance}"
+        )
+    known_side = _SIDES.get(side or "", arm.sensor.side)
+    return View(lens, (low, high), float(tilt), known_side)
 
 
 def _board_of(arm: Chain) -> Board:
@@ -85,8 +93,6 @@ def _posed(arm: Chain) -> Chain:
 def seen_by(arm: Chain, commands: Array) -> tuple[Array, Array, Array]:
     """Commands with the board as it is predicted; places (N, 3) and rotations
     (N, 3, 3) of the board in the camera."""
-    from scipy.spatial.transform import Rotation
-
     joints = commands[:, : arm.num_joints]
     # Of a board seen at zero: its pose in the camera.
     pose = _posed(arm).predict(np.hstack([joints, np.zeros((len(joints), 6))]))
@@ -114,28 +120,21 @@ def aimed(
     low: Array,
     high: Array,
     view: View,
-    ends: tuple[float, float],
     rng: np.random.Generator,
 ) -> Array:
     """Commands towards poses of the board in the camera that are drawn."""
-    from scipy.spatial.transform import Rotation
-
-    sensor, j, count = _board_of(arm), arm.num_joints, len(commands)
-    middle = sensor.outline.mean(axis=0)
+    j, count = arm.num_joints, len(commands)
+    middle = _board_of(arm).outline.mean(axis=0)
     width, height, fx, fy, cx, cy = view.camera
-    far = rng.uniform(*ends, count)
+    far = rng.uniform(*view.ends, count)
     aim = rng.uniform(0.25, 0.75, (count, 2)) * [width, height]
     centre = np.column_stack([(aim - [cx, cy]) / [fx, fy], np.ones(count)])
     centre *= (far / np.linalg.norm(centre, axis=1))[:, None]
     # A board that faces the camera, turned about its axis, then tilted.
-    known_side = view.side or sensor.side
-    side = np.full(count, known_side) if known_side else rng.choice([-1.0, 1.0], count)
-    facing = Rotation.from_rotvec(
-        np.where(side[:, None] > 0.0, [np.pi, 0.0, 0.0], [0.0, 0.0, 0.0])
-    )
-    spin = Rotation.from_rotvec(
-        rng.uniform(-np.pi, np.pi, count)[:, None] * [0, 0, 1.0]
-    )
+    side = np.full(count, view.side) if view.side else rng.choice([-1.0, 1.0], count)
+    facing = Rotation.from_rotvec((side[:, None] > 0.0) * [np.pi, 0.0, 0.0])
+    about_axis = rng.uniform(-np.pi, np.pi, count)[:, None]
+    spin = Rotation.from_rotvec(about_axis * [0.0, 0.0, 1.0])
     about = rng.uniform(-np.pi, np.pi, count)
     angle = np.radians(view.tilt) * np.sqrt(rng.random(count)) * 0.95
     lean = np.column_stack([np.cos(about), np.sin(about), 0.0 * about])
@@ -147,28 +146,9 @@ def aimed(
     return np.hstack([moved[:, :j], commands[:, j:]])
 
 
-def distances(arm: Chain, view: View) -> tuple[float, float]:
-    """Least and greatest from the camera to the board's middle."""
-    points = _board_of(arm).outline
-    size = 2.0 * np.linalg.norm(points - points.mean(axis=0), axis=1).max()
-    if view.distance is not None:
-        return view.distance
-    if not size > 0.0:
-        raise ValueError(
-            "distance is missing: (least, greatest) from the camera to the board; "
-            "Board has neither corners nor extent"
-        )
-    width, fx = view.camera[0], view.camera[2]
-    small, large = _FILLED
-    return fx * size / (large * width), fx * size / (small * width)
-
-
-def in_picture(
-    arm: Chain, commands: Array, view: View, ends: tuple[float, float]
-) -> tuple[Array, list[str]]:
+def in_picture(arm: Chain, commands: Array, view: View) -> tuple[Array, list[str]]:
     """Commands with what the camera sees of the board, and why it is of no use."""
     sensor = _board_of(arm)
-    known_side = view.side or sensor.side
     width, height, fx, fy, cx, cy = view.camera
     commands, place, rotation = seen_by(arm, commands)
     spots = sensor.outline @ np.matrix_transpose(rotation) + place[:, None]
@@ -187,10 +167,10 @@ def in_picture(
     why = np.full(len(spots), "", dtype=object)
     flat = np.abs(face) < np.cos(np.radians(view.tilt))
     why[flat] = "see the board at too flat an angle"
-    why[(away < ends[0]) | (away > ends[1])] = "are too near or too far"
+    why[(away < view.ends[0]) | (away > view.ends[1])] = "are too near or too far"
     why[~inside.all(axis=1)] = "do not have the whole board in the picture"
-    if known_side:
-        why[face * known_side <= 0.0] = "see the board from behind"
+    if view.side:
+        why[face * view.side <= 0.0] = "see the board from behind"
     return commands, why.tolist()
 
 
@@ -204,8 +184,8 @@ def towards_zero(
 ) -> Array:
     """Commands after damped steps towards readings of zero, within the limits.
 
-    Of contacts as long as they are off by more than ``limit``, joints at their limits
-    held; of poses, in ``unit`` (6,), roughly.
+    Of contacts while they are off by more than ``limit``; of poses, in ``unit`` (6,),
+    roughly.
     """
     commands, j = commands.copy(), arm.num_joints
     poses, most = unit is not None, 0.1 if unit is None else 0.15

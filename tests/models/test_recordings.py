@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal.arms.files.recordings import rests, rests_of
+from jaxcal.arms.files.recordings import rests
 from jaxcal.models import (
     Board,
     Distance,
@@ -154,7 +154,7 @@ def test_what_is_no_recording_is_refused_in_one_line(tmp_path):
         (broken, r"broken\.mcap cannot be read as a ROS bag: [^\n]+$"),
     ):
         with pytest.raises(ValueError, match=message):
-            rests_of(Recording(path), PANDA.joint_names, np.ones(7, bool))
+            PANDA.at_rest(path)
 
 
 def test_a_recording_is_identified_and_checked_as_its_table_is(tmp_path):

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import pathlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.files.servos import Servos
-from jaxcal.checks import Array, in_words
+from jaxcal.checks import Array, in_words, numbers
 from jaxcal.extras import needs
 from jaxcal.models.recording import Recording
 
@@ -21,29 +23,78 @@ _JITTER = 8.0  # standard deviations: no reading of a joint at rest is farther a
 _STATES = "sensor_msgs/msg/JointState"
 
 
-def rests_of(
-    recording: Recording,
-    names: Sequence[str],
-    turning: NDArray[np.bool_],
-    kind: str = "",
-) -> tuple[Array, Array | None]:
-    """Where a recorded arm stood still, and what its sensor read there.
+def at_rest(
+    arm: Chain,
+    path: str | os.PathLike[str],
+    *,
+    seconds: float = 0.5,
+    within: float | None = None,
+) -> Array:
+    """Postures (N, J) at which a recorded arm stood still, in their order.
 
     Args:
-        recording: a bag or a LeRobot dataset.
-        names: (J,) of the joints.
-        turning: (J,) which of them are in degrees.
-        kind: of the sensor whose messages are asked for, "" for none.
-
-    Returns:
-        (N, J) means of the joints, degrees and units of length; (N, r) of the readings
-        as recorded, None where none were asked for.
+        arm: whose joints are looked for.
+        path: rosbag2 folder (SQLite or MCAP) with joint states. Needs the extra
+            ``ros``.
+        seconds: of rest, at least.
+        within: degrees (or units of length) in which a resting joint stays. By default
+            0.05, or eight times what the joint's readings jitter by.
 
     Raises:
-        ValueError: no such joints or messages are in it, or the arm never stood still;
-            it says how the joints jitter.
+        ValueError: the arm never stood still; it says how the joints jitter.
+    """
+    return _rests_of(arm, Recording(path, seconds=seconds, within=within))[0]
+
+
+def recorded(arm: Chain, recording: Recording) -> tuple[Array, Array | None]:
+    """Commands (N, n) and readings (N, q) of a recording, the mean of each rest.
+
+    Readings are zeros of contacts and of poses of a board, which stand in the commands,
+    and None where no message holds them (corners' pixels) or of a LeRobot dataset.
+
+    Raises:
+        ValueError: the arm never stood still, ``which`` does not fit, or there are no
+            readings.
         MissingExtraError: what reads it is not installed.
     """
+    sensor = arm.sensor
+    views = sensor.views and sensor.zeros
+    if not views and tuple(sensor.inputs) not in ((), (sensor.kind,)):
+        raise ValueError(
+            f"commands of a {sensor.kind} need {', '.join(sensor.inputs)}, which no "
+            "recording has; pass the postures of at_rest"
+        )
+    pixels = sensor.views and not views
+    commands, read = _rests_of(arm, recording, "" if pixels else sensor.kind)
+    matrices = np.zeros((len(commands), 3, 3))
+    if read is not None and (views or arm.relative):
+        matrices = read[:, 3:].reshape(-1, 3, 3).swapaxes(1, 2)
+    if views:
+        if read is None:
+            raise ValueError(f"{recording.path} has no board poses")
+        turns = Rotation.from_matrix(matrices).as_rotvec(degrees=True)
+        commands = np.column_stack([commands, read[:, :3], turns])
+    elif sensor.inputs:
+        which = () if recording.which is None else recording.which
+        if len(which) != len(commands):
+            raise ValueError(
+                f"which must give the {sensor.kind} of each of the {len(commands)} "
+                f"rests, got {len(which)} numbers"
+            )
+        commands = np.column_stack([commands, numbers("which", which)])
+    if sensor.zeros:
+        return commands, np.zeros((len(commands), len(sensor.outputs)))
+    if read is not None and arm.relative:
+        read = np.hstack([read[:, :3], arm.rotation_vectors(commands, matrices)])
+    return commands, read
+
+
+def _rests_of(
+    arm: Chain, recording: Recording, kind: str = ""
+) -> tuple[Array, Array | None]:
+    """Means of the joints (N, J) where the arm stood still, in degrees and lengths, and
+    of the messages (N, r) for a ``kind`` of sensor, None for ""."""
+    names, turning = arm.joint_names, np.array(arm.command_units) == "deg"
     columns = {name: recording.names.get(name, name) for name in names}
     path = pathlib.Path(recording.path)
     if (path / "meta" / "info.json").is_file():
@@ -83,8 +134,6 @@ def _vector(part: Any) -> list[float]:
 
 def _pose(message: Any) -> list[float]:
     """Position, then the columns of its rotation, whose mean is nearly one."""
-    from scipy.spatial.transform import Rotation
-
     at, turn = message.pose.position, message.pose.orientation
     matrix = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
     return [*_vector(at), *matrix.T.ravel().tolist()]
@@ -177,8 +226,7 @@ def _dataset(
 ) -> list[tuple[Array, Array]]:
     """Times (T,) and joints (T, J) in degrees of each episode of a LeRobot dataset.
 
-    Of versions 2 and 3: ``observation.state`` of ``data/**/*.parquet``, its columns
-    named by ``meta/info.json``, motors as "shoulder_pan.pos".
+    Of versions 2 and 3, its columns named by ``meta/info.json``.
     """
     with needs("lerobot", "reading a LeRobot dataset"):
         from pyarrow import parquet
@@ -219,8 +267,7 @@ def _dataset(
 def jitter(joints: Array) -> Array:
     """(J,) standard deviation of what a resting joint reads, of joints (T, J).
 
-    From second differences, in which a steady motion leaves nothing; the median, so
-    that a third of the recording may be jerks.
+    The median of second differences: neither steady motion nor a few jerks count.
     """
     if len(joints) < 3:
         return np.zeros(joints.shape[1])
@@ -234,10 +281,9 @@ def rests(
     """(N, J) means of the stretches of ``seconds`` or more that stay ``within``, and
     (N, 2) from when to when.
 
-    When not given that is 0.05, or eight times what the joint jitters by if that is
-    more; the first and the last third of a stretch then agree to 0.05 and the noise of
-    their means, so a slow motion is no rest. A stretch at the posture of the one before
-    is the same rest.
+    By default within 0.05, or eight times what the joint jitters by; the first and the
+    last third of a stretch then agree, so a slow motion is no rest. A stretch at the
+    posture of the one before is the same rest.
     """
     noise = jitter(joints)
     most = np.full(joints.shape[1], _WITHIN if within is None else within)

@@ -10,9 +10,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.checks import Array
 from jaxcal.files import write_over
+from jaxcal.models.model import as_parameters
 
 _KEYS = ("id", "drive_mode", "homing_offset", "range_min", "range_max")
 
@@ -23,8 +26,7 @@ class Servos:
 
     A motor at ``position`` steps (its encoder less ``homing_offset``) is at ``(position
     - (range_min + range_max) / 2) 360 / (resolution - 1)`` degrees, or at -100 to 100
-    from one end of its range to the other, reversed where ``drive_mode`` is 1, as in
-    LeRobot's ``MotorsBus``. The middle of the range is the joint's zero.
+    of its range, reversed where ``drive_mode`` is 1, as in LeRobot's ``MotorsBus``.
 
     Attributes:
         motors: by name, ``id``, ``drive_mode``, ``homing_offset``, ``range_min`` and
@@ -55,12 +57,7 @@ class Servos:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], resolution: int = 4096) -> Self:
-        """Read the file that ``lerobot-calibrate`` wrote.
-
-        Raises:
-            OSError: it cannot be read.
-            ValueError: it is none; the message names the file.
-        """
+        """Read the file that ``lerobot-calibrate`` wrote."""
         text = pathlib.Path(path).read_text(encoding="utf-8-sig")
         try:
             content = json.loads(text)
@@ -76,11 +73,8 @@ class Servos:
         write_over(path, json.dumps(content, indent=4) + "\n", force)
 
     def degrees(self, names: Sequence[str], values: Array) -> Array:
-        """(N, J) degrees of motors by name, of values (N, J) in -100 to 100.
-
-        Raises:
-            ValueError: a value is beyond 100, as degrees are.
-        """
+        """(N, J) degrees of motors by name, of values (N, J) in -100 to 100, else a
+        ValueError."""
         most = float(np.abs(values).max(initial=0.0))
         if most > 100.0 + 1e-3:
             raise ValueError(
@@ -103,8 +97,7 @@ class Servos:
         """These motors where joints are ``by`` degrees ahead of what they read.
 
         The middle of the range moves back by as many steps, and the range is narrowed
-        to be even about it: no motor is sent where it was not before. Homing offsets
-        and all else stay.
+        to be even about it: no motor is sent where it was not before. All else stays.
         """
         motors: dict[str, Any] = {name: dict(m) for name, m in self.motors.items()}
         for name, degrees in by.items():
@@ -124,3 +117,35 @@ class Servos:
         if name not in self.motors:
             raise ValueError(f"motors must hold {name}, got {', '.join(self.motors)}")
         return self.motors[name]
+
+
+def write_servos(
+    arm: Chain,
+    path: str | os.PathLike[str],
+    parameters: ArrayLike,
+    servos: str | os.PathLike[str],
+    names: Mapping[str, str],
+    *,
+    force: bool = False,
+) -> dict[str, int]:
+    """Write LeRobot's calibration file with the joints' zeros of ``parameters`` (p,).
+
+    Of turning joints alone. ``servos`` is the file that is corrected, ``names`` are
+    motors whose names differ from the joints'.
+
+    Returns:
+        Steps by which the middle of each motor's range moved.
+    """
+    theta = as_parameters(arm, parameters)
+    rows = (theta - arm.nominal)[: arm.table.size].reshape(arm.table.shape)
+    ahead = {}
+    for k, (name, unit) in enumerate(
+        zip(arm.joint_names, arm.command_units, strict=True)
+    ):
+        moved = np.flatnonzero(arm.drive[:, k])
+        if unit == "deg" and len(moved) == 1:
+            ahead[names.get(name, name)] = rows[moved[0], 3] / arm.drive[moved[0], k]
+    old = Servos.load(servos)
+    new = old.moved(ahead)
+    new.save(path, force=force)
+    return {name: round(new.middle(name) - old.middle(name)) for name in ahead}

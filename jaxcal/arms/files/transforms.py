@@ -6,6 +6,7 @@ import os
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.arguments import pose_matrix
 from jaxcal.arms.files.urdf import joints_of, links_of, table_of, walk
@@ -38,8 +39,6 @@ class StaticTransform(NamedTuple):
     @property
     def quaternion(self) -> Array:
         """(4,) x, y, z, w."""
-        from scipy.spatial.transform import Rotation
-
         return np.asarray(Rotation.from_matrix(self.matrix[:3, :3]).as_quat())
 
     def __str__(self) -> str:
@@ -68,9 +67,9 @@ def static_transform(
     Args:
         calibration: of an arm with ``Board``.
         child: name of the camera's optical frame (z ahead, x to the right in the
-            picture, not a driver's camera_link); "camera_optical_frame" if not given.
-        parent: name of the link that it is in; of a URDF file the tip link, or the base
-            of a camera that stands, when not given.
+            picture, not a driver's camera_link); by default "camera_optical_frame".
+        parent: link that it is in; by default a URDF file's tip link, or the base of a
+            camera that stands.
         camera: of several that see one board, its number.
 
     Raises:

@@ -48,8 +48,8 @@ def read_urdf(
 
     Raises:
         ValueError: the file is malformed or a xacro file, a joint of the chain is of
-        another type, the links form a loop, or ``tip``, ``base`` and ``locked`` are not
-        in it; the message names the link or joint.
+            another type, the links form a loop, or ``tip``, ``base`` or ``locked`` is
+            not in it.
     """
     name = os.fspath(path)
     # Bytes of any encoding and ends of lines come through text unchanged.
@@ -252,10 +252,8 @@ def _numbers(
 def led(
     joint: Joint, joints: dict[str, Joint], locked: Mapping[str, float]
 ) -> tuple[str | None, float, float]:
-    """The joint whose command moves this one, how far, and its value at zero.
-
-    None where it stands still. In degrees and metres.
-    """
+    """The joint whose command moves this one, None where it stands still; how far; its
+    value at zero in degrees and metres."""
     times, plus, unit = 1.0, 0.0, _unit(joint)
     followed = [joint.name]
     while joint.name not in locked:

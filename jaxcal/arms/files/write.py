@@ -7,6 +7,7 @@ constants between its joints follow from the table: ``K = C^-1 D C'``, D a row o
 from __future__ import annotations
 
 import functools
+import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,8 +16,12 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
+from jaxcal.arms.arguments import pose_matrix
 from jaxcal.arms.arm import Arm
+from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.files.urdf import (
     Joint,
     joints_of,
@@ -28,12 +33,16 @@ from jaxcal.arms.files.urdf import (
     turn_of_z,
     walk,
 )
+from jaxcal.arms.sensors.sensor import BASE
 from jaxcal.checks import Array, one_of
+from jaxcal.files import write_over
+from jaxcal.models.model import as_parameters
 
 _UR = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _TAG = re.compile(rb"""(?:[^>"']+|"[^"]*"|'[^']*')*>""")
 _SAME = 1e-13  # metres and radians: no correction
 _AGREE = 1e-9  # metres and radians: the same correction
+_POSTURES = 500  # that show where an arm stands
 
 
 class _Part(NamedTuple):
@@ -55,19 +64,90 @@ class _Part(NamedTuple):
         return np.asarray(whole @ np.linalg.inv(self.stands))
 
 
-def written(form: str, nominal: Arm, calibrated: Arm) -> tuple[str, str]:
-    """The text of a form of ``SerialChain.write``, and the tip link, if any."""
+def write(
+    arm: Chain,
+    form: str,
+    path: str | os.PathLike[str],
+    parameters: ArrayLike,
+    *,
+    force: bool = False,
+) -> str:
+    """Write the arm with ``parameters`` as a file that robots read.
+
+    Such files cannot hold compliance and gear harmonics: these are left out, with a
+    warning.
+
+    Args:
+        arm: the nominal one.
+        form: "urdf" is the file that the arm came from, its origins corrected: all else
+            stays as it is, and the tip goes where ``predict`` of positions puts it, the
+            base in the measuring frame included. "dh" is the table as CSV: joint, a,
+            alpha, d, theta (with the joint's offset), beta, without base, tool and
+            convention; a warning names joints that follow others. "ur" is the YAML file
+            of Universal Robots' ROS description, for six joints, without base and tool.
+        path: the file to write.
+        parameters: (p,) as ``identify`` found them.
+        force: overwrite an existing file.
+
+    Returns:
+        Of "urdf" the tip link, a new one where no fixed joint before it could hold the
+            tool; else "".
+
+    Raises:
+        ValueError: the arm is not of the form, as with joints that follow others for
+            "ur"; a gear ratio was found, which none can hold.
+        FileExistsError: there is a file and ``force`` is not given.
+    """
+    ratios, yields, waves = arm._drives(as_parameters(arm, parameters))
+    for i in np.flatnonzero(ratios != 1.0):
+        raise ValueError(
+            f"gear{i + 1} is {ratios[i]:.6g}, which this file format cannot hold"
+        )
+    lost = [f"compliance{arm.compliance[i]}" for i in np.flatnonzero(yields)]
+    bent = np.flatnonzero(waves.any(axis=1))
+    lost += [f"harmonics of joint {arm.harmonics[i]}" for i in bent]
+    if lost:
+        warnings.warn(
+            f"{', '.join(lost)} left out: the file cannot hold compliance and gear "
+            "harmonics",
+            stacklevel=2,
+        )
     one_of("form", form, ("urdf", "dh", "ur"))
+    calibrated, tip = arm.calibrated(parameters), ""
     if form == "urdf":
-        text, tips = urdf_text([(nominal, calibrated)])
-        return text, tips[0]
-    return _dh_text(calibrated) if form == "dh" else _ur_text(nominal, calibrated), ""
+        text, (tip,) = urdf_text([(arm, calibrated)])
+    else:
+        text = _dh_text(calibrated) if form == "dh" else _ur_text(arm, calibrated)
+    write_over(path, text, force)
+    return tip
+
+
+def standing_as(arm: Chain, other: Any, parameters: Array, commands: Array) -> Array:
+    """(p,) ``parameters``, the base where the tip is nearest to that of ``other``, over
+    all postures within the limits, a turn or the range of ``commands``."""
+    joints = commands[:, : arm.num_joints]
+    turns = np.array(arm.command_units)[:, None] == "deg"
+    limits = np.where(turns, arm.limits.clip(-180.0, 180.0), arm.limits)
+    ranges = np.column_stack([joints.min(axis=0), joints.max(axis=0)])
+    low, high = np.where(np.isfinite(limits), limits, ranges).T
+    rng = np.random.default_rng(0)
+    postures = rng.uniform(low, high, (_POSTURES, len(low)))
+    tips = arm.calibrated(parameters).predict(postures)
+    targets = np.asarray(other.predict(postures))
+    middle, there = tips.mean(axis=0), targets.mean(axis=0)
+    turn, _ = Rotation.align_vectors(targets - there, tips - middle)
+    at = [arm.names.index(name) for name in BASE]
+    base = pose_matrix(parameters[at])
+    moved = parameters.copy()
+    turned = (turn * Rotation.from_matrix(base[:3, :3])).as_euler("XYZ", True)
+    moved[at] = [*(turn.apply(base[:3, 3] - middle) + there), *turned]
+    return moved
 
 
 def urdf_text(chains: Sequence[tuple[Arm, Arm]]) -> tuple[str, list[str]]:
     """The file of nominal chains with the origins of calibrated ones, and its tips.
 
-    A tip is a new link where the file has no fixed joint that could hold the tool.
+    A tip is a new link where no fixed joint of the file could hold the tool.
 
     Raises:
         ValueError: a chain is of no URDF file, or what was found cannot be in one.
@@ -308,11 +388,8 @@ def with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str
 
 
 def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int, str]:
-    """Where tags begin in a URDF file, in bytes, and its encoding.
-
-    Returns:
-        For each joint its tag and its origin's; the end of the robot; the encoding.
-    """
+    """For each joint of a URDF file where its tag and its origin's begin, in bytes; the
+    end of the robot; the encoding."""
     parser = expat.ParserCreate()
     path: list[str] = []
     places: dict[str, tuple[int, int | None]] = {}

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.sensors.pose import Pose, rotation_vector_rate
 from jaxcal.arms.sensors.sensor import AXES, BASE, Reading, Sensor, Tip, hats, turns
@@ -27,31 +28,28 @@ class Board(Sensor):
     what stands still, ``tool`` of what moves, and both are found without a guess.
 
     Without ``corners`` a view is six zeros, the board's pose in the camera as predicted
-    less seen. Commands have six more columns, that pose as it was seen: ``seen x``,
-    ``y``, ``z`` and its rotation vector ``seen rx``, ``ry``, ``rz`` in degrees (the
-    tvec and rvec of OpenCV). Noise 0.1 % of the arm's length, 0.1 degrees, or
-    ``Noise(covariance=...)`` of the views.
-
-    With ``corners`` it is their pixels, u and v of each, lens distortion taken out;
-    noise 0.3 pixels.
+    less seen. Commands have six more columns, that pose: ``seen x``, ``y``, ``z`` and
+    its rotation vector ``seen rx``, ``ry``, ``rz`` in degrees (the tvec and rvec of
+    OpenCV). Noise 0.1 % of the arm's length, 0.1 degrees, or ``Noise(covariance=...)``
+    of the views. With ``corners`` it is their pixels, u and v of each, lens distortion
+    taken out; noise 0.3 pixels.
 
     Attributes:
         moves: "camera" or "board", which is on the tip.
         place: (4, 4) of the other in the measuring frame; found when not given.
         corners: (C, 3) of the board in its own frame, in its plane z = 0.
-        camera: focal lengths and centre in pixels (fx, fy, cx, cy); with the size of
-            its picture before them, (width, height, fx, fy, cx, cy), corners outside
-            of it are refused, and postures are planned for that camera.
+        camera: in pixels (fx, fy, cx, cy); with the size of its picture, (width,
+            height, fx, fy, cx, cy), corners outside of it are refused, and postures are
+            planned for it.
         side: 1 where the board's z axis points to cameras that see it, -1 where it
             points away; 0 is not known, views tell.
-        extent: width and height of the board from the origin of its pose, for postures
-            from which all of it is seen; that of ``corners`` where they are given.
-        distortion: (k1, k2, p1, p2) or with k3 of the lens, as OpenCV's (not of its
-            fisheye), by which a corner that is outside without it is known to be in
-            the picture; none when not given. Corners are read as corrected by it
-            already.
-        same_board: in ``Several``, this camera stands and sees the board that the first
-            of them sees, which is on the tip once.
+        extent: width and height of a board without corners from its origin, to plan
+            views.
+        distortion: OpenCV's (k1, k2, p1, p2) or with k3, by which a corner that is
+            outside without it is known to be in the picture. Corners are corrected by
+            it already.
+        same_board: in ``Several``, this camera stands and sees the board on the tip
+            that the first of them sees.
         intrinsics: of ``corners``, focal lengths and centre are unknowns too, known to
             5 % and 2 % of the focal length; ``camera`` is where they begin.
     """
@@ -126,8 +124,8 @@ class Board(Sensor):
         return np.array(self.camera[:2]) if len(self.camera) == 6 else None
 
     def in_picture(self, spots: Array, margin: float = 0.0) -> NDArray[np.bool_]:
-        """(...) whether the camera has pixels (..., 2) without distortion in its
-        picture, or up to ``margin`` pixels outside of it."""
+        """(...) whether pixels (..., 2) without distortion are in the camera's picture,
+        or up to ``margin`` pixels outside of it."""
         focal, centre = self.lens
         bent, seen = self.bent((spots - centre) / focal)
         pixels = focal * bent + centre
@@ -197,8 +195,6 @@ class Board(Sensor):
         return BASE
 
     def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
-        from scipy.spatial.transform import Rotation
-
         place = np.eye(3) if self.place is None else self.place[:3, :3]
         turn, axes = turns(parameters[3:6])
         stand, turn = turn @ place, np.radians(axes)  # of the stand, by its angles
@@ -250,8 +246,6 @@ class Board(Sensor):
         self, tip: Tip, inputs: Array, measured: Array | None
     ) -> tuple[Self, Array | None]:
         """Tool X and place Z of ``A X = Z B`` in closed form (Shah, 2013)."""
-        from scipy.spatial.transform import Rotation
-
         if self.place is not None or (self.corners is not None and measured is None):
             return self, None
         if len(inputs) < _FEW:
@@ -328,8 +322,8 @@ class Board(Sensor):
 def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Array]:
     """How far off the views are, the place Z and the tool X of ``A X = Z B``.
 
-    Far off, in the median of turns in radians and shifts in lengths of the arm, where
-    the views do not determine them. Views four times as far off as that are left out.
+    The median of turns in radians and shifts in lengths of the arm, inf where the views
+    do not determine them. Views four times as far off are left out.
     """
     place, new = np.eye(4), np.eye(4)
     used, off = np.ones(len(turn), dtype=bool), np.full(len(turn), np.inf)
@@ -368,16 +362,12 @@ def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Ar
 def _about_one_axis(
     arm: Array, position: Array, turn: Array, shift: Array
 ) -> tuple[Array, Array] | None:
-    """The stand's rotation where the tip turns about one axis, as a SCARA's, or none.
+    """The stand's rotation where the tip turns about one axis, as a SCARA's, and
+    directions (3, 2) in the tip's frame, (3, 0) without a turn, in which views show
+    where the tool is.
 
     How far the tip goes shows what its turns do not. None where it hardly moves.
-
-    Returns:
-        It, and directions (3, 2) in the tip's frame, (3, 0) without a turn, in which
-        views show where the tool is.
     """
-    from scipy.spatial.transform import Rotation
-
     vectors = Rotation.from_matrix(arm @ arm[0].T).as_rotvec()
     seen = Rotation.from_matrix(turn @ turn[0].T).as_rotvec()
     moved, ways = position - position.mean(axis=0), shift - shift.mean(axis=0)

@@ -49,9 +49,9 @@ class Distance(Landmarks):
     ) -> tuple[Self, Array | None]:
         """Anchors nearest to nominal points and lengths, from linear starts.
 
-        One is linear in the anchor and its square; of one that is far, with short ways
-        of the tip, the lengths are. The zero too, where lengths fit three times as well
-        with another one (twice from 30 lengths on), and to 2 % of the arm.
+        One is linear in the anchor and its square; of one that is far the lengths are.
+        The zero too, where lengths fit three times as well with another one (twice from
+        30 lengths on), and to 2 % of the arm.
         """
         from scipy import optimize
 

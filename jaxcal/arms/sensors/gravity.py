@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.sensors.sensor import AtRest, Reading, Tip, hats
 from jaxcal.checks import Array, in_words
@@ -21,9 +22,8 @@ class Gravity(AtRest):
     """Acceleration x, y, z in the tip's frame at rest: up, as accelerometers read it.
 
     Lengths, and a turn about the vertical, are not shown and held. A joint's zero
-    cannot be told from the turns of the next axes, alpha and beta: the prior shares
-    the error out, and their intervals say so. The scale of the sensor is known to 2 %,
-    its bias to 5 %; noise 0.1 % of ``magnitude``.
+    cannot be told from the turns of the next axes: the prior shares the error out. The
+    scale of the sensor is known to 2 %, its bias to 5 %; noise 0.1 % of ``magnitude``.
 
     Attributes:
         magnitude: what a level sensor reads, 9.81 for m/s^2 or 1 for g.
@@ -66,8 +66,6 @@ class Gravity(AtRest):
         self, tip: Tip, inputs: Array, measured: Array | None
     ) -> tuple[Self, Array | None]:
         """Itself. Refused are another unit or up, and a sensor that is turned."""
-        from scipy.spatial.transform import Rotation
-
         if measured is None:
             return self, None
         size = float(np.median(np.linalg.norm(measured, axis=1)))

@@ -17,10 +17,9 @@ from jaxcal.models.model import Quantity
 class Plane(Landmarks):
     """One zero a touch: the tip's height above its plane.
 
-    What is measured is zero; a constant, such as the radius of the probe, belongs to
-    the plane. Where the arm stands is not shown, so ``base`` is held. ``places`` are
-    rows (normal x, y, z, distance from the origin along it). Noise 0.01 % of the
-    arm's length.
+    A constant, such as the radius of the probe, belongs to the plane. Where the arm
+    stands is not shown, so ``base`` is held. ``places`` are rows (normal x, y, z,
+    distance from the origin along it). Noise 0.01 % of the arm's length.
     """
 
     kind = "plane"

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.sensors.sensor import AXES, Reading, Sensor, Tip, hats
 from jaxcal.checks import Array
@@ -30,8 +31,6 @@ class Pose(Sensor):
         return [1e-4 * length] * 3 + [float(np.degrees(1e-4))] * 3
 
     def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
-        from scipy.spatial.transform import Rotation
-
         turn = tip.rotation @ np.matrix_transpose(tip.nominal())
         vector = np.asarray(Rotation.from_matrix(turn).as_rotvec())
         by_tip = np.zeros((len(vector), 6, 6))

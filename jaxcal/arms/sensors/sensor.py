@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from jaxcal.checks import Array, array_of, in_words, numbers, whole_number
 from jaxcal.models.model import Quantity
@@ -146,7 +147,7 @@ class Sensor(abc.ABC):
         return np.zeros(len(self.names))
 
     def prior_std(self, length: float) -> Array:
-        """(s,) of its own parameters, for an arm of this length; nothing is known."""
+        """(s,) of its own parameters, for an arm of this length."""
         return np.full(len(self.names), np.inf)
 
     @abc.abstractmethod
@@ -162,18 +163,14 @@ class Sensor(abc.ABC):
         """Readings at N postures, with columns ``inputs`` (N, e) and parameters."""
 
     def wrapped(self, off: Array, inputs: Array, length: float) -> Array:
-        """(..., N, q) differences of readings at columns ``inputs`` (N, e), those that
-        wrap within half a period."""
+        """(..., N, q) differences of readings, those that wrap within half a period."""
         return within_half(off, self.periods)
 
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None
     ) -> tuple[Self, Array | None]:
-        """This sensor where nominal postures (and readings) say that it stands.
-
-        Returns:
-            It, and where its tool is seen from the nominal one (4, 4), if that is new.
-        """
+        """This sensor where nominal postures (and readings) say that it stands, and
+        where its tool is seen from the nominal one (4, 4), if that is new."""
         return self, None
 
     @property
@@ -234,14 +231,11 @@ class Sensor(abc.ABC):
         yield Readings(self, tip, inputs, measured, rows, scale)
 
     def facts(self, parameters: Array) -> tuple[Array, Array]:
-        """What is known of its own parameters besides: (F,) off, (F, s) derivative.
-
-        Both in standard deviations: a fact is a reading that needs no posture.
-        """
+        """What is known of its own parameters besides, in standard deviations: (F,)
+        off, (F, s) derivative."""
         return np.zeros(0), np.zeros((0, len(parameters)))
 
     def stds(self, length: float) -> Array:
-        """(q,) standard deviations of the readings."""
         noise = self.usual_noise(length) if self.noise is None else self.noise
         std = numbers("noise of the sensor", noise)
         q = len(self.outputs)
@@ -334,10 +328,7 @@ class Landmarks(Sensor):
 
 
 class AtRest(Sensor):
-    """A sensor at the tip that feels gravity while the arm is at rest.
-
-    Lengths of the arm, and a turn about the vertical, are not shown.
-    """
+    """A sensor at the tip that feels gravity while the arm is at rest."""
 
     magnitude: float  # of gravity
     up: tuple[float, float, float]  # in the measuring frame
@@ -367,8 +358,6 @@ def hats(vectors: Array) -> Array:
 
 def turns(angles: Array) -> tuple[Array, Array]:
     """Rotation (3, 3) Rx Ry Rz by degrees (3,); the axes of its turns as columns."""
-    from scipy.spatial.transform import Rotation
-
     whole, axes = np.eye(3), np.eye(3)
     for k, axis in enumerate("xyz"):
         axes[:, k] = whole[:, k]

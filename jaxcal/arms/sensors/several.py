@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Self
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,14 +28,14 @@ class Several(Sensor):
     """Readings of some sensors, each in units of its own noise.
 
     Commands have the column ``sensor``, which says of each row which one read it, and
-    then the columns of all of them (0 where they are another's);
-    ``SerialChain.together`` makes such tables. The first is at the tool; where the
-    others are on it are parameters of their own, known as a tool is.
+    then the columns of all (0 where they are another's); ``SerialChain.together`` makes
+    such tables. The first is at the tool; where the others are on it are parameters of
+    their own, known as a tool is.
 
     Attributes:
         sensors: two or more.
-        mounts: (S - 1, 4, 4) where the others are, seen from the tool; there with it
-            when not given.
+        mounts: (S - 1, 4, 4) where the others are, seen from the tool; there when not
+            given.
     """
 
     sensors: tuple[Sensor, ...] = ()
@@ -257,12 +257,30 @@ class Several(Sensor):
         return content | {"sensors": [one.to_dict() for one in self.sensors]}
 
 
-def in_noise(
-    what: str, readings: ArrayLike | None, count: int, noise: Array, q: int
-) -> Array:
-    """(count, q) readings in units of their noise, zeros beyond them and of none."""
-    measured = np.zeros((count, q))
-    if readings is not None:
-        values = array_of(f"measured of {what}", readings, count, len(noise))
-        measured[:, : len(noise)] = values / noise
-    return measured
+class OneTable(NamedTuple):
+    """Commands and readings of one sensor or chain."""
+
+    name: str
+    number: int  # in the column that tells the rows apart
+    columns: Sequence[int]  # of the commands of all
+    noise: Array  # of its readings
+    commands: ArrayLike
+    measured: ArrayLike | None  # None for zeros
+
+
+def stacked(
+    tables: Iterable[OneTable], label: int, n: int, q: int
+) -> tuple[Array, Array]:
+    """Commands (N, n) and readings (N, q) in noise of all tables, one after another;
+    ``label`` is the column of their numbers."""
+    all_commands, all_measured = [], []
+    for name, number, columns, noise, given, readings in tables:
+        rows = array_of(f"commands of {name}", given, "N", len(columns))
+        commands, measured = np.zeros((len(rows), n)), np.zeros((len(rows), q))
+        commands[:, label], commands[:, columns] = number, rows
+        if readings is not None:
+            values = array_of(f"measured of {name}", readings, len(rows), len(noise))
+            measured[:, : len(noise)] = values / noise
+        all_commands.append(commands)
+        all_measured.append(measured)
+    return np.vstack(all_commands), np.vstack(all_measured)

@@ -17,15 +17,13 @@ from jaxcal.checks import Array, numbers
 class Socket(Landmarks):
     """Three zeros a contact: the ball's centre less that of its socket.
 
-    What is measured is zero. Contacts do not show where the arm stands, so ``base`` is
-    held; without a known distance they do not show its scale, which is the prior's: a
-    fit compares misses with the size of the arm (``Model.log_size``).
-    ``places`` are the centres (S, 3); noise, the play of the ball, 0.02 % of the arm's
-    length.
+    Contacts do not show where the arm stands, so ``base`` is held; without a known
+    distance they do not show its scale, which is the prior's: a fit compares misses
+    with the size of the arm (``Model.log_size``). ``places`` are the centres (S, 3);
+    noise, the play of the ball, 0.02 % of the arm's length.
 
     Attributes:
-        distances: rows (first, second, distance, std) of two sockets and how far apart
-            their centres are.
+        distances: rows (first, second, distance, std) of two sockets.
     """
 
     distances: Sequence[Sequence[float]] = ()

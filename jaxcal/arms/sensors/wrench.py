@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.sensors.sensor import AtRest, Reading, Tip, hats
 from jaxcal.checks import Array, array_of, in_words, numbers
@@ -28,20 +29,17 @@ class Wrench(AtRest):
     With R from the tip to the measuring frame and the load's mass m and centre c in the
     tip's frame, ``force = m magnitude R' down + zero`` and ``torque = c x (the same) +
     zero``: the load pulls on the sensor. A sensor that reads what holds the load has
-    the other sign; negate its readings. An arm that hangs needs its base, or ``up``:
-    its readings look the same, as do those of a controller that subtracts a heavier
-    payload, and none of these is assumed. The zeros are those of the electronics.
+    the other sign; negate its readings. An arm that hangs needs its base, or ``up``.
 
     Lengths, and a turn about the vertical, are not shown and held. How the sensor is
     turned on the tool (``tool rx``, ``ry``, ``rz``, found without a guess from four
-    readings) and which way is down (``base rx``, ``ry``) are known as those of any
-    tool and base. A load that no posture tells from the zeros, as on a SCARA, is known
-    to half its mass and a tenth of the arm's length. Torques are in newtons times the
+    readings) and which way is down (``base rx``, ``ry``) are known as those of any tool
+    and base. A load that no posture tells from the zeros, as on a SCARA, is known to
+    half its mass and a tenth of the arm's length. Torques are in newtons times the
     arm's unit of length. Noise 0.1 N, and as much at 5 % of the arm's length.
 
     Attributes:
-        mass: of the load with what of the sensor moves with it, kg, roughly; a choice
-            of postures hangs on it little.
+        mass: of the load with what of the sensor moves with it, kg, roughly.
         centre: (3,) of the load in the tip's frame, roughly.
         magnitude: of gravity, 9.81 for newtons.
         up: (3,) direction in the measuring frame.
@@ -106,8 +104,6 @@ class Wrench(AtRest):
         From differences of the forces: zeros do not matter. Refused are torques in
         another unit, forces against gravity, and an arm that stands otherwise.
         """
-        from scipy.spatial.transform import Rotation
-
         if measured is None or len(measured) < _FEW:
             return self, None
         force, torque = np.split(measured - measured.mean(axis=0), 2, axis=1)
