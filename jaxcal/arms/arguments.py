@@ -22,9 +22,14 @@ def rows_of(table: ArrayLike) -> Array:
             "table must have shape (n, 4), rows (a, alpha, d, theta), or (n, 5) "
             f"with beta, got {rows.shape}"
         )
-    rows = np.column_stack([rows, np.zeros((len(rows), 5 - rows.shape[1]))])
-    _require_degrees(rows)
-    return rows
+    alpha = rows[rows[:, 1] != 0.0, 1]
+    right = np.isclose(np.abs(alpha), np.pi / 2, atol=2e-3)
+    if alpha.size and (right | np.isclose(np.abs(alpha), np.pi, atol=2e-3)).all():
+        raise ValueError(
+            f"alpha of table must be in degrees, got {in_words(alpha)}, which look "
+            "like right angles in radians"
+        )
+    return np.column_stack([rows, np.zeros((len(rows), 5 - rows.shape[1]))])
 
 
 def joint_kinds(joints: str | None, n: int) -> str:
@@ -64,17 +69,6 @@ def limits_of(pairs: ArrayLike | None, columns: int) -> Array:
             f"limits must be LOW, HIGH of each command, got {in_words(limits[bad[0]])}"
         )
     return limits
-
-
-def _require_degrees(rows: Array) -> None:
-    """Refuse a table whose right angles are all in radians."""
-    alpha = rows[:, 1][rows[:, 1] != 0.0]
-    right = np.isclose(np.abs(alpha), np.pi / 2, atol=2e-3)
-    if alpha.size and (right | np.isclose(np.abs(alpha), np.pi, atol=2e-3)).all():
-        raise ValueError(
-            f"alpha of table must be in degrees, got {in_words(alpha)}, which look "
-            "like right angles in radians"
-        )
 
 
 def transform(argument: str, given: ArrayLike | None) -> Array:

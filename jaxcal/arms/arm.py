@@ -78,18 +78,11 @@ class Arm:
     @property
     def nominal(self) -> Array:
         """(p,) table, gears, compliance, base, tool, the sensor's own, harmonics."""
-        return np.concatenate(
-            [
-                self.table.ravel(),
-                np.ones(len(self.gears)),
-                self.yields,
-                self.base[:3, 3],
-                np.zeros(3),
-                np.concatenate([self.tool[:3, 3], np.zeros(3)])[self._tool],
-                self.sensor.nominal,
-                self.waves.ravel(),
-            ]
-        )
+        tool = np.append(self.tool[:3, 3], np.zeros(3))[self._tool]
+        base = np.append(self.base[:3, 3], np.zeros(3))
+        driven = np.append(np.ones(len(self.gears)), self.yields)
+        own, waves = self.sensor.nominal, self.waves.ravel()
+        return np.concatenate([self.table.ravel(), driven, base, tool, own, waves])
 
     def rotation_vectors(self, commands: ArrayLike, rotations: ArrayLike) -> Array:
         """Measured rotations (N, 3, 3) at commands (N, n) as turns from nominal (N, 3).
@@ -144,19 +137,16 @@ class Arm:
     @functools.cached_property
     def _steps_of_parameters(self) -> NDArray[np.intp]:
         """The step that each parameter moves; the sensor's own move none."""
-        n = len(self.joints)
         moved = self._steps_of_joints
-        first = len(_BASE) + len(_ROW) * np.arange(n)
-        tool = len(_BASE) + len(_ROW) * n
-        return np.concatenate(
-            [
-                (first[:, None] + _ORDER[self.convention]).ravel(),
-                moved[[i - 1 for i in (*self.gears, *self.compliance)]],
-                np.arange(6),
-                tool + np.array([0, 1, 2, 4, 5, 6])[self._tool],
-                np.repeat(moved[[i - 1 for i in self.harmonics]], 4),
-            ]
+        *rows, tool = len(_BASE) + len(_ROW) * np.arange(len(self.joints) + 1)
+        parts = (
+            np.add.outer(rows, _ORDER[self.convention]).ravel(),
+            moved[[i - 1 for i in (*self.gears, *self.compliance)]],
+            np.arange(6),
+            tool + np.array([0, 1, 2, 4, 5, 6])[self._tool],
+            np.repeat(moved[[i - 1 for i in self.harmonics]], 4),
         )
+        return np.concatenate(parts)
 
     def _split(self, parameters: Array) -> tuple[Array, Array, Array]:
         """Base (6,), tool (6,) and the sensor's own (s,)."""
@@ -235,8 +225,7 @@ class Arm:
                 "hk,hkn->hn", waves, self._swing(commands, parameters)[0]
             )
         base, tool, _ = self._split(parameters)
-        rows = parameters[: 5 * n].reshape(n, 5)
-        rows = rows[:, self._order]
+        rows = parameters[: 5 * n].reshape(n, 5)[:, self._order]
         one = np.concatenate([base, [0.0], rows.ravel(), tool[:3], [0.0], tool[3:]])
         values = np.repeat(one[:, None], len(commands), axis=1)
         values[self._steps_of_joints] += moves
@@ -317,19 +306,11 @@ class Arm:
 
     def _grows(self, commands: Array) -> bool:
         """Whether some of what it reads is zero, and grows with the arm."""
-        if not self._touches or self._revolute.all():
-            return self._touches
-        ways = np.ptp(commands[:, self._slides], axis=0)
+        if not any(one.zeros and one.lengths for one in self.sensor.members):
+            return False
+        slides = np.flatnonzero(self.drive[~self._revolute].any(axis=0))
+        ways = np.ptp(commands[:, slides], axis=0)
         return bool((ways < _STILL * self.length).all())
-
-    @functools.cached_property
-    def _touches(self) -> bool:
-        return any(one.zeros and one.lengths for one in self.sensor.members)
-
-    @functools.cached_property
-    def _slides(self) -> NDArray[np.intp]:
-        """Columns of the commands by which joints slide."""
-        return np.flatnonzero(self.drive[~self._revolute].any(axis=0))
 
     @functools.cached_property
     def _shifts(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:

@@ -39,7 +39,7 @@ COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # 1.7 degrees of the base and the tool.
 _LENGTH, _TWIST, _ZERO = 1.5e-3, 0.3, 0.5  # share of the links' length; degrees
 _GEAR, _SAG = 5e-3, 0.5  # ratio; degrees under the largest torque
-_WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.045  # of gears; degrees
+WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.045  # of gears; degrees
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
 # Of the arm's length: positions so far off are in another frame; so alike, of this arm.
 _NEAR, _ALIKE = 0.2, 0.05
@@ -161,6 +161,7 @@ class SerialChain(Arm, Model):
         if bending and not len(loads):
             loads = _usual_loads(n, end)
         per_torque = np.zeros(len(bending)) if yields is None else yields
+        swings = np.zeros((len(bent), 4)) if waves is None else waves
         return cls(
             rows,
             one_of("convention", convention, ("standard", "modified")),
@@ -172,7 +173,7 @@ class SerialChain(Arm, Model):
             bending,
             array_of("yields", per_torque, len(bending)),
             bent,
-            _waves(waves, len(bent)),
+            np.zeros((0, 4)) if not bent else array_of("waves", swings, len(bent), 4),
             tuple(load(one, n) for one in loads),
             tuple(array_of("gravity", gravity, 3).tolist()),
             axis_names("joint_names", joint_names or _numbered(columns), "", columns),
@@ -443,15 +444,14 @@ class SerialChain(Arm, Model):
     @functools.cached_property
     def command_units(self) -> tuple[str, ...]:
         """J units of the joints' columns, "deg" or "length"."""
-        kinds = []
-        for name, column in zip(self.joint_names, self.drive.T, strict=True):
-            # A column drives itself by one, its gear ratio apart.
-            joint = int(np.abs(np.abs(column) - 1.0).argmin())
-            kind = self.joints[joint]
-            if column[joint] != 1.0 and self.source is not None:
-                kind = joints_of(self.source["text"])[name].kind
-            kinds.append("deg" if kind == "R" else "length")
-        return tuple(kinds)
+        # A column drives itself by one, its gear ratio apart.
+        at = np.abs(np.abs(self.drive) - 1.0).argmin(axis=0)
+        kinds = [self.joints[joint] for joint in at]
+        plain = self.drive[at, range(len(at))] == 1.0
+        if self.source is not None and not plain.all():
+            in_file = joints_of(self.source["text"])
+            kinds = [in_file[name].kind for name in self.joint_names]
+        return tuple("deg" if kind == "R" else "length" for kind in kinds)
 
     def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
         return self.quantities_of(self.sensor, measured_unit)
@@ -474,12 +474,10 @@ class SerialChain(Arm, Model):
         return of_file if measured_unit.startswith(others) else measured_unit or of_file
 
     def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
-        units = (
-            quantity.unit
-            for one in self.sensor.members
-            for quantity in self.quantities_of(one, measured_unit)
+        of_each = [self.quantities_of(s, measured_unit) for s in self.sensor.members]
+        return tuple(
+            dict.fromkeys(q.unit for quantities in of_each for q in quantities)
         )
-        return tuple(dict.fromkeys(units))
 
     def own(self, i: int) -> slice:
         """Where what the sensor's member ``i`` has of its own is among the p."""
@@ -497,22 +495,17 @@ class SerialChain(Arm, Model):
             *BASE,
             *(f"tool {axis}" for axis in self.sensor.tool),
             *self.sensor.names,
-            *(f"theta{i} {wave}" for i in self.harmonics for wave in _WAVES),
+            *(f"theta{i} {wave}" for i in self.harmonics for wave in WAVES),
         )
 
     @property
     def units(self) -> tuple[str, ...]:
         """p units: "length" (the table's), "deg", "ratio", "deg per torque", ..."""
-        mounting = ["length"] * 3 + ["deg"] * 3
-        return (
-            *["length", "deg", "length", "deg", "deg"] * len(self.joints),
-            *["ratio"] * len(self.gears),
-            *["deg per torque"] * len(self.compliance),
-            *mounting,
-            *(mounting[i] for i in self._tool),
-            *self.sensor.units,
-            *["deg"] * self.waves.size,
-        )
+        row, mounting = ["length", "deg"] * 2 + ["deg"], ["length"] * 3 + ["deg"] * 3
+        driven = ["ratio"] * len(self.gears) + ["deg per torque"] * len(self.compliance)
+        tool, waves = [mounting[i] for i in self._tool], ["deg"] * self.waves.size
+        table = row * len(self.joints)
+        return (*table, *driven, *mounting, *tool, *self.sensor.units, *waves)
 
     def predict(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
@@ -619,19 +612,16 @@ class SerialChain(Arm, Model):
         mounting = [_MOUNTING * length] * 3 + [_MOUNTING_ANGLE] * 3
         tool = [self.sensor.members[0].mounting * length] * 3 + [_MOUNTING_ANGLE] * 3
         torque = length * sum(abs(weight) for _, weight, _ in self.loads)
-        return Prior(
-            [
-                *joint * len(self.joints),
-                *[_GEAR] * len(self.gears),
-                *[_SAG / torque if torque else np.inf] * len(self.compliance),
-                *mounting,
-                *(tool[i] for i in self._tool),
-                *self.sensor.prior_std(length),
-                *[_WAVE] * self.waves.size,
-            ],
-            fixed=self.sensor.unseen(self),
-            by_data=True,
-        )
+        std = [
+            *joint * len(self.joints),
+            *[_GEAR] * len(self.gears),
+            *[_SAG / torque if torque else np.inf] * len(self.compliance),
+            *mounting,
+            *(tool[i] for i in self._tool),
+            *self.sensor.prior_std(length),
+            *[_WAVE] * self.waves.size,
+        ]
+        return Prior(std, fixed=self.sensor.unseen(self), by_data=True)
 
     def parameter_sizes(self) -> Array:
         """(p,) of the default prior; where it says nothing the arm's length, a radian:
@@ -658,8 +648,8 @@ class SerialChain(Arm, Model):
     @property
     def slips(self) -> tuple[str, ...]:
         """The joints' zeros."""
-        zeros = zip(self.joints, range(1, len(self.joints) + 1), strict=True)
-        return tuple(f"{'theta' if kind == 'R' else 'd'}{i}" for kind, i in zeros)
+        zeros = enumerate(self.joints, 1)
+        return tuple(f"{'theta' if kind == 'R' else 'd'}{i}" for i, kind in zeros)
 
     @property
     def relative(self) -> bool:
@@ -693,11 +683,10 @@ class SerialChain(Arm, Model):
             for name, value in values.items()
         }
         # JSON knows no infinity: null is a limit that is not known.
-        ends = [
-            [end if np.isfinite(end) else None for end in row] for row in self.limits
-        ]
-        sensor = self.sensor.to_dict()
-        return {"kind": "serial_chain", **data, "limits": ends, "sensor": sensor}
+        ends = self.limits.astype(object)
+        ends[np.isinf(self.limits)] = None
+        rest = {"limits": ends.tolist(), "sensor": self.sensor.to_dict()}
+        return {"kind": "serial_chain", **data, **rest}
 
 
 def _far(points: Array, measured: Array, length: float) -> Array:
@@ -721,16 +710,6 @@ def turning(joints: str) -> list[int]:
 def _numbered(columns: int) -> tuple[str, ...]:
     """Names of joints that have none."""
     return tuple(f"joint {i + 1}" for i in range(columns))
-
-
-def _waves(waves: ArrayLike | None, count: int) -> Array:
-    """(count, 4) degrees by sin and cos of the angle and of twice it; 0 for None."""
-    if waves is None:
-        return np.zeros((count, 4))
-    swings = numbers("waves", waves)
-    if swings.size != 4 * count:
-        raise ValueError(f"waves must have shape ({count}, 4)")
-    return swings.reshape(-1, 4)
 
 
 def _usual_loads(n: int, tool: Array) -> tuple[Load, ...]:

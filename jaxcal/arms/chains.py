@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.arms.chain import COLUMNS, SerialChain
+from jaxcal.arms.chain import COLUMNS, WAVES, SerialChain
 from jaxcal.arms.findings import CLEAR_UP, Part, other_distances
 from jaxcal.arms.plausible import require_places, require_readings, require_touched
 from jaxcal.arms.sensors import Sensor, Tip
@@ -132,15 +132,10 @@ class Chains(Model):
         ):
             links = [f"{name}{i}" for i in range(1, shared) for name in COLUMNS]
             common = {*links, *(BASE if shared else ())}
-            common |= {
-                name
-                for name in arm.names
-                for i in range(1, shared + 1)
-                if name in (f"gear{i}", f"compliance{i}")
-                or name.startswith(f"theta{i} ")
-            }
-            prefix = dict.fromkeys(arm.names, f"{tip}: ") | dict.fromkeys(common, "")
-            of_arm = [prefix[name] + name for name in arm.names]
+            for i in range(1, shared + 1):
+                common |= {f"gear{i}", f"compliance{i}"}
+                common |= {f"theta{i} {wave}" for wave in WAVES}
+            of_arm = [n if n in common else f"{tip}: {n}" for n in arm.names]
             for i, number in enumerate(self.stands[k]):
                 (first, at), *others = self._members[number]
                 if others:
@@ -316,15 +311,13 @@ class Chains(Model):
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
         theta = as_parameters(self, parameters)
         offs, rows = [np.zeros(0)], [np.zeros((0, len(theta)))]
-        for k, (arm, at) in enumerate(zip(self.chains, self.members, strict=True)):
-            for i, number in enumerate(self.stands[k]):
-                if self._members[number][0] != (k, i):  # a distance is known once
-                    continue
-                columns = at[arm.own(i)]
-                off, slopes = arm.sensor.members[i].facts(theta[columns])
-                offs.append(off)
-                rows.append(np.zeros((len(off), len(theta))))
-                rows[-1][:, columns] = slopes
+        for (k, i), *_ in self._members:  # a distance is known once
+            arm = self.chains[k]
+            columns = self.members[k][arm.own(i)]
+            off, slopes = arm.sensor.members[i].facts(theta[columns])
+            offs.append(off)
+            rows.append(np.zeros((len(off), len(theta))))
+            rows[-1][:, columns] = slopes
         return np.concatenate(offs), np.concatenate(rows)
 
     def default_noise(self) -> Noise:
@@ -362,32 +355,21 @@ class Chains(Model):
     def error_groups(self) -> ErrorGroups:
         """Groups as of ``SerialChain`` of each chain, of harmonics one for all, last;
         what chains share is in the first one's."""
-        of_chains = [arm.error_groups() for arm in self.chains]
-        count = len(of_chains[0].medians) - 1
-        last = count * len(of_chains)
-        members = []
-        for k, of_chain in enumerate(of_chains):
-            numbered = of_chain.members + count * k
-            numbered[of_chain.members == count] = last
-            numbered[of_chain.members < 0] = -1
-            members.append(numbered)
-
-        def of_all(one: Array) -> Array:
-            return np.append(np.tile(one[:-1], len(of_chains)), one[-1])
-
-        return ErrorGroups(
-            self._gather(members),
-            of_all(of_chains[0].medians),
-            of_all(of_chains[0].spreads),
+        groups = [arm.error_groups() for arm in self.chains]
+        count, members = len(groups[0].medians) - 1, []
+        for k, (of_arm, _, _) in enumerate(groups):
+            numbered = np.where(of_arm < 0, -1, of_arm + count * k)
+            members.append(np.where(of_arm == count, count * len(groups), numbered))
+        medians, spreads = (
+            np.append(np.tile(one[:-1], len(groups)), one[-1]) for one in groups[0][1:]
         )
+        return ErrorGroups(self._gather(members), medians, spreads)
 
     @property
     def misfit_std(self) -> float:
         """Largest of the chains' misfits of a reading, in noise."""
-        return max(
-            arm.misfit_std / float(self._scale(k).min())
-            for k, arm in enumerate(self.chains)
-        )
+        arms = enumerate(self.chains)
+        return max(arm.misfit_std / float(self._scale(k).min()) for k, arm in arms)
 
     @property
     def fits_misfit(self) -> bool:
@@ -606,17 +588,11 @@ class Chains(Model):
             if len(readings) < 2:
                 continue
             k, i = self._members[number][0]
-            part = Part(
-                number,
-                readings[0].sensor,
-                readings[0].sensor.kind,
-                "",
-                used,
-                np.vstack([of_chain.columns for of_chain in readings]),
-                np.vstack([of_chain.tip.position for of_chain in readings]),
-                self.members[k][self.chains[k].own(i)],
-                readings[0].scale,
-            )
+            sensor, own = readings[0].sensor, self.members[k][self.chains[k].own(i)]
+            columns = np.vstack([of_chain.columns for of_chain in readings])
+            points = np.vstack([of_chain.tip.position for of_chain in readings])
+            where = (used, columns, points, own, readings[0].scale)
+            part = Part(number, sensor, sensor.kind, "", *where)
             alone = [part._replace(columns=r.columns).touched() for r in readings]
             parts.append(part._replace(judged=np.any(alone, axis=0)))
         return parts
@@ -678,10 +654,7 @@ class Chains(Model):
 
     @classmethod
     def from_dict(
-        cls,
-        tips: Sequence[str],
-        chains: Sequence[Any],
-        stands: Sequence[Sequence[int]],
+        cls, tips: Sequence[str], chains: Sequence[Any], stands: Sequence[Sequence[int]]
     ) -> Self:
         """The inverse of ``to_dict``."""
         arms = [

@@ -68,26 +68,14 @@ def parts_of(calibration: Fit, used: NDArray[np.intp]) -> list[Part]:
     model, commands = calibration.model, calibration.commands[used]
     tip, inputs = model.nominal_tip(commands), commands[:, model.num_joints :]
     kinds, parts = [one.kind for one in model.sensor.members], []
-    several = [*model.sensor.of_members(tip, inputs, None)]
-    alone = sum(len(read.rows) > 0 for read in several) == 1
-    for i, read in enumerate(several):
+    for i, read in enumerate(model.sensor.of_members(tip, inputs, None)):
         twice = kinds.count(read.sensor.kind) > 1
         kind = f"sensor {i}'s {read.sensor.kind}" if twice else read.sensor.kind
         if len(read.rows):
-            parts.append(
-                Part(
-                    i,
-                    read.sensor,
-                    kind,
-                    "" if alone else kind,
-                    used[read.rows],
-                    read.columns,
-                    read.tip.position,
-                    model.own(i),
-                    read.scale,
-                )
-            )
-    return parts
+            rows, points, own = used[read.rows], read.tip.position, model.own(i)
+            what, where = (i, read.sensor, kind, kind), (rows, read.columns, points)
+            parts.append(Part(*what, *where, own, read.scale))
+    return [parts[0]._replace(title="")] if len(parts) == 1 else parts
 
 
 def unit_after(calibration: Fit) -> str:
@@ -156,8 +144,8 @@ def findings_of(
         for part in parts
         if isinstance(part.sensor, Wrench)
     ]
-    doubtful |= wrong or unused
-    doubtful |= bool(contradicting or exchanged or other_arm or mistaken)
+    doubtful |= wrong or unused or mistaken != ""
+    doubtful |= bool(contradicting or exchanged or other_arm)
     vague = left_open(parts, unit_after(calibration), anywhere, nominal)
     reasons += [vague.fact] if vague else []
     return Findings(
@@ -181,14 +169,14 @@ def left_open(
     sized = any(part.touched().any() for part in sockets)
     if sized or not anywhere > _VAGUE * nominal:
         return None
-    fact, remedy = "Too few readings:", MORE
+    fact, remedy = "Too few readings", MORE
     if sockets:
         remedy = "give the distance between two sockets (distances=, --distance)"
         fact = (
-            "The distance between two sockets is missing, so the arm's size is unknown:"
+            "The distance between two sockets is missing, so the arm's size is unknown"
         )
     return Reason(
-        f"{fact} away from the measured poses the tip is uncertain by {anywhere:.2g}"
+        f"{fact}: away from the measured poses the tip is uncertain by {anywhere:.2g}"
         f"{unit}; uncalibrated it is off by {nominal:.2g}{unit}.",
         remedy,
     )
@@ -376,24 +364,22 @@ def _other_links(calibration: Fit, parts: list[Part]) -> list[str]:
     std = np.asarray(calibration.standard_errors)
     sure = np.where(np.isfinite(std), off - 2.0 * std, 0.0)[: model.table.size]
     lengths = units[: model.table.size] == "length"
-    most = np.full(model.table.size, _LINK * model.length)
+    far = np.flatnonzero(lengths & (sure > _LINK * model.length))
     reasons = []
-    if not any(p.sensor.positions and not p.sensor.relative for p in parts):
-        far = np.flatnonzero(lengths & (sure > most))
-        if far.size:
-            reasons.append(
-                f"{', '.join(names[far])}: up to "
-                f"{off[far].max():.3g}{unit_after(calibration)} from the arm's "
-                "description. Are the readings of another arm, in another unit, of a "
-                "board of another size, or of several sockets numbered as one?"
-            )
-    turned = [name.startswith("theta") for name in names[: model.table.size]]
-    for i in np.flatnonzero(turned & (sure > _ZERO)):
+    tracked = any(p.sensor.positions and not p.sensor.relative for p in parts)
+    if far.size and not tracked:
         reasons.append(
-            f"{names[i]} is {off[i]:.3g} degrees from the arm's description: is the "
-            "joint's zero or sign wrong?"
+            f"{', '.join(names[far])}: up to {off[far].max():.3g}"
+            f"{unit_after(calibration)} from the arm's description. Are the readings "
+            "of another arm, in another unit, of a board of another size, or of "
+            "several sockets numbered as one?"
         )
-    return reasons
+    turned = np.char.startswith(names[: model.table.size], "theta")
+    return reasons + [
+        f"{names[i]} is {off[i]:.3g} degrees from the arm's description: is the "
+        "joint's zero or sign wrong?"
+        for i in np.flatnonzero(turned & (sure > _ZERO))
+    ]
 
 
 def _exchanged(calibration: Fit, part: Part) -> list[str]:

@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
-from jaxcal.arms.findings import (
-    MORE,
-    Findings,
-    Part,
-    findings_of,
-    parts_of,
-    unit_after,
-)
+from jaxcal.arms.findings import MORE, Findings, Part, findings_of, parts_of, unit_after
 from jaxcal.arms.plausible import mistaken_columns
 from jaxcal.arms.sensors import Pose, Socket
 from jaxcal.arms.sensors.sensor import hats

@@ -198,8 +198,7 @@ def _dh_text(calibrated: Arm) -> str:
     names, others = _moved_by(calibrated)
     if others:
         warnings.warn(
-            f"the table cannot hold coupled joints: {', '.join(others)}",
-            stacklevel=4,
+            f"the table cannot hold coupled joints: {', '.join(others)}", stacklevel=4
         )
     table = calibrated.table.copy()
     at = [3 if kind == "R" else 2 for kind in calibrated.joints]  # theta or d

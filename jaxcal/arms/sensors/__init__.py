@@ -1,15 +1,11 @@
 """What an arm is measured with: sensors that turn the tip's pose into readings."""
 
+from jaxcal.arms.sensors.at_rest import Gravity, Wrench
 from jaxcal.arms.sensors.board import Board
-from jaxcal.arms.sensors.distance import Distance
-from jaxcal.arms.sensors.gravity import Gravity
-from jaxcal.arms.sensors.plane import Flush, Plane
-from jaxcal.arms.sensors.pose import Pose
-from jaxcal.arms.sensors.position import Position
-from jaxcal.arms.sensors.sensor import Landmarks, Reading, Sensor, Tip, hats
+from jaxcal.arms.sensors.landmarks import Distance, Flush, Landmarks, Plane, Socket
+from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip, hats
 from jaxcal.arms.sensors.several import Several
-from jaxcal.arms.sensors.socket import Socket
-from jaxcal.arms.sensors.wrench import Wrench
+from jaxcal.arms.sensors.trackers import Pose, Position
 
 __all__ = [
     "SENSORS",
@@ -34,18 +30,5 @@ __all__ = [
 Placed = Landmarks  # as it was called in 0.2
 
 # By their names in files and on the command line; a sensor of one's own is added here.
-SENSORS: dict[str, type[Sensor]] = {
-    one.kind: one
-    for one in (
-        Position,
-        Pose,
-        Socket,
-        Plane,
-        Flush,
-        Distance,
-        Gravity,
-        Wrench,
-        Board,
-        Several,
-    )
-}
+_KINDS = (Position, Pose, Socket, Plane, Flush, Distance, Gravity, Wrench, Board)
+SENSORS: dict[str, type[Sensor]] = {one.kind: one for one in (*_KINDS, Several)}

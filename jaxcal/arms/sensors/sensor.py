@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from jaxcal.checks import Array, array_of, in_words, numbers, whole_number
+from jaxcal.checks import Array, numbers
 from jaxcal.models.model import Quantity
 from jaxcal.models.predictions import within_half
 
@@ -260,93 +260,6 @@ class Sensor(abc.ABC):
     def from_dict(cls, content: Mapping[str, Any]) -> Self:
         """The sensor that ``to_dict`` wrote."""
         return cls(**{key: content[key] for key in content if key != "kind"})
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Landmarks(Sensor):
-    """A sensor with things that stand around the arm: sockets, planes, anchors.
-
-    Attributes:
-        count: how many there are. From two on the commands have one more column,
-            named as the sensor, which says of each row which one it is, from 0.
-        places: (count, width) where they stand, roughly; found from the first readings
-            when not given.
-    """
-
-    count: int = 1
-    places: Array | None = None
-
-    stands = True
-    axes: ClassVar[tuple[str, ...]]  # w names of the parameters of one of them
-    axis_units: ClassVar[tuple[str, ...]]
-    width: ClassVar[int]  # numbers that say where one stands
-
-    def __post_init__(self) -> None:
-        whole_number("count", self.count, 1)
-        if self.places is not None:
-            places = array_of("places", self.places, self.count, self.width)
-            object.__setattr__(self, "places", places)
-
-    @property
-    def num_places(self) -> int:
-        return self.count
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        return (self.kind,) if self.count > 1 else ()
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        numbered = [f"{self.kind}{i}" for i in range(self.count)]
-        each = numbered if self.count > 1 else [self.kind]
-        return tuple(f"{name} {axis}" for name in each for axis in self.axes)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        return self.axis_units * self.count
-
-    @property
-    def nominal(self) -> Array:
-        if self.places is None:
-            return np.zeros(self.count * len(self.axes))
-        return self.places.ravel()
-
-    def unseen(self, arm: Any) -> tuple[str, ...]:
-        return BASE
-
-    def of_rows(self, inputs: Array) -> NDArray[np.int64]:
-        if self.count == 1:
-            return np.zeros(len(inputs), dtype=np.int64)
-        return label(self.kind, inputs[:, 0], self.count)
-
-    def spread(self, which: NDArray[np.int64], by_one: Array) -> Array:
-        """(N, q, s) derivative by all parameters, of (N, q, w) by those of a row's."""
-        count, q, w = by_one.shape
-        full = np.zeros((count, q, self.count, w))
-        full[np.arange(count), :, which] = by_one
-        return full.reshape(count, q, self.count * w)
-
-
-class AtRest(Sensor):
-    """A sensor at the tip that feels gravity while the arm is at rest."""
-
-    magnitude: float  # of gravity
-    up: tuple[float, float, float]  # in the measuring frame
-
-    tool = ("rx", "ry", "rz")
-
-    def __post_init__(self) -> None:
-        up = array_of("up", self.up, 3)
-        if not np.linalg.norm(up) > 0.0:
-            raise ValueError(f"up must be a direction (3,), got {in_words(up)}")
-        if not numbers("magnitude", self.magnitude) > 0.0:
-            raise ValueError(f"magnitude must be positive, got {self.magnitude}")
-        object.__setattr__(self, "up", tuple((up / np.linalg.norm(up)).tolist()))
-
-    def unseen(self, arm: Any) -> tuple[str, ...]:
-        lengths = zip(arm.names, arm.units, strict=True)
-        hidden = [n for n, u in lengths if u == "length" and n not in self.names]
-        return (*hidden, f"base r{'xyz'[int(np.abs(self.up).argmax())]}")
 
 
 def hats(vectors: Array) -> Array:

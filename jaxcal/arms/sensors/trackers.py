@@ -1,4 +1,4 @@
-"""Motion capture: position and orientation of the tool."""
+"""Trackers and motion capture: position, and orientation, of the tool."""
 
 from __future__ import annotations
 
@@ -11,6 +11,25 @@ from scipy.spatial.transform import Rotation
 from jaxcal.arms.sensors.sensor import AXES, Reading, Sensor, Tip, hats
 from jaxcal.checks import Array
 from jaxcal.models.model import Quantity
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Position(Sensor):
+    """x, y, z of the tip in the measuring frame; noise 0.01 % of the arm's length."""
+
+    kind = "position"
+    positions = True
+    lengths = True
+    outputs = ("x", "y", "z")
+    misfit = 3e-4
+
+    def usual_noise(self, length: float) -> ArrayLike:
+        return 1e-4 * length
+
+    def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
+        count = len(tip.position)
+        by_tip = np.broadcast_to(np.eye(3, 6), (count, 3, 6))
+        return Reading(tip.position, by_tip, np.zeros((count, 3, 0)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
