@@ -99,7 +99,6 @@ class Chains(Model):
             base, locked, limits: as of ``SerialChain.from_urdf``, of joints of any
                 chain.
         """
-
         arms = {}
         for tip, sensor in sensors.items():
             arm = SerialChain.from_urdf(

@@ -125,25 +125,22 @@ def in_words(fit: Fit, unit: str) -> list[str]:
     tried = fit.provenance.get("effects")
     if not tried:
         return []
-    before = tried["held_out"][_AS_IT_IS]
-    others = ", ".join(
-        f"{name} {error:.3g}"
-        for name, error in tried["held_out"].items()
-        if name not in (_AS_IT_IS, tried["chosen"])
-    )
-    if tried["chosen"] == _AS_IT_IS:
+    errors, name = dict(tried["held_out"]), tried["chosen"]
+    before = errors.pop(_AS_IT_IS)
+    after = errors.pop(name, None)
+    others = ", ".join(f"{other} {error:.3g}" for other, error in errors.items())
+    if after is None:
         return [
             f"None of these effects reduces the cross-validated error: {others}{unit}; "
             f"without them {before:.3g}{unit}."
         ]
-    after = tried["held_out"][tried["chosen"]]
     return [
-        f"Added effect: {tried['chosen']}. It reduces the cross-validated error from "
+        f"Added effect: {name}. It reduces the cross-validated error from "
         f"{before:.3g} to {after:.3g}{unit} (with {others})."
     ]
 
 
-def play_in_words(fit: Fit, unit: str) -> list[str]:
+def play_in_words(fit: Fit) -> list[str]:
     """Joints whose residuals follow the side that they came from, rows being in the
     order of measuring."""
     model, commands = fit.model, fit.commands

@@ -211,8 +211,8 @@ def verdict(model: Chain, calibration: ArmFit) -> ArmVerdict:
         )
     if not explains and not calibration.noise_known:
         unit_of_first = "" if errors[0].unit == "length" else f" {errors[0].unit}"
-        reasons += tuple(in_words(calibration, unit_of_first))
-        reasons += tuple(play_in_words(calibration, unit_of_first))
+        effects = in_words(calibration, unit_of_first) + play_in_words(calibration)
+        reasons += tuple(effects)
     accuracy = calibration.provenance.get("accuracy")
     if isinstance(accuracy, float):  # of a file of 0.2
         accuracy = {errors[0].unit: accuracy}
@@ -223,12 +223,11 @@ def verdict(model: Chain, calibration: ArmFit) -> ArmVerdict:
     else:
         good = bool(clean and helps and (explains or ratio + half < _LITTLE))
     more = accuracy is not None or helps is None
+    step = _next_step(findings, scatter, calibration.noise_known, more)
     return ArmVerdict(
         good=good,
         reasons=reasons,
-        next_step=models.USE
-        if good
-        else _next_step(findings, scatter, calibration.noise_known, more),
+        next_step=models.USE if good else step,
         unit=unit,
         explains=explains,
         helps=helps,
@@ -252,8 +251,8 @@ class Place(NamedTuple):
         """Both in words; of what is not shown nothing."""
         sizes = [f"{self.std[0]:.2g}{unit or ' in length'}", f"{self.std[1]:.2g} deg"]
         turns = [name for name in self.hidden if name[-2] == "r"]
-        lost = [len(self.hidden) - len(turns) == 3, len(turns) == 3]
-        shown = [size for size, none in zip(sizes, lost, strict=True) if not none]
+        lost = (len(self.hidden) - len(turns), len(turns))
+        shown = [size for size, count in zip(sizes, lost, strict=True) if count < 3]
         return " and ".join(shown) or "nothing"
 
 
@@ -404,10 +403,8 @@ def _anywhere(
     )
     slopes = slopes[:, :3] * part.scale[:3, None]
     slopes[..., part.own] = 0.0
-    if (
-        calibration.unidentified is not None
-        and depends(slopes, calibration.unidentified).any()
-    ):
+    null = calibration.unidentified
+    if null is not None and depends(slopes, null).any():
         return part, np.nan
     points = model.nominal_tips(drawn)
     whole = np.repeat(np.eye(3, 6)[None], _DRAWN, axis=0)

@@ -165,8 +165,9 @@ def in_picture(arm: Chain, commands: Array, view: View) -> tuple[Array, list[str
     away = np.linalg.norm(there, axis=1)
     face = (rotation[:, :, 2] * -there).sum(axis=1) / np.maximum(away, 1e-9)
     why = np.full(len(spots), "", dtype=object)
-    flat = np.abs(face) < np.cos(np.radians(view.tilt))
-    why[flat] = "see the board at too flat an angle"
+    why[np.abs(face) < np.cos(np.radians(view.tilt))] = (
+        "see the board at too flat an angle"
+    )
     why[(away < view.ends[0]) | (away > view.ends[1])] = "are too near or too far"
     why[~inside.all(axis=1)] = "do not have the whole board in the picture"
     if view.side:

@@ -104,11 +104,10 @@ def _rests_of(
             raise ValueError(f"servos needs a LeRobot dataset: {path} is none")
         times, joints, messages = _bag(path, [*columns.values()], kind, recording.topic)
         parts = [(times, np.where(turning, np.degrees(joints), joints))]
-    tables, spans = [], []
-    for times, joints in parts:
-        postures, between = rests(times, joints, recording.seconds, recording.within)
-        tables.append(postures)
-        spans.append(between)
+    tables, spans = zip(
+        *(rests(*part, recording.seconds, recording.within) for part in parts),
+        strict=True,
+    )
     postures = np.concatenate(tables)
     if not len(postures):
         raise ValueError(
@@ -243,14 +242,11 @@ def _dataset(
             f"{', '.join(columns) or 'none'}"
         )
     files = sorted((path / "data").rglob("*.parquet"))
-    episodes, times, states = [], [], []
-    for file in files:
-        held = parquet.read_table(
-            file, columns=["episode_index", "timestamp", "observation.state"]
-        ).to_pydict()
-        episodes += held["episode_index"]
-        times += held["timestamp"]
-        states += held["observation.state"]
+    wanted = ["episode_index", "timestamp", "observation.state"]
+    read = [parquet.read_table(file, columns=wanted).to_pydict() for file in files]
+    episodes, times, states = (
+        [row for table in read for row in table[key]] for key in wanted
+    )
     if not states:
         raise ValueError(f"{path} must hold data/**/*.parquet, got none")
     values = np.array(states, dtype=np.float64)[:, [columns.index(n) for n in names]]

@@ -92,7 +92,7 @@ def static_transform(
     theta, source = again.parameters, model.source
     if sensor.moves == "camera":
         names = tool
-        matrix = np.linalg.inv(_tip(model)) @ model.calibrated(theta).tool
+        matrix = np.linalg.inv(_tip(source)) @ model.calibrated(theta).tool
     else:
         names = list(owns[camera][:6])
         at = [model.names.index(name) for name in names]
@@ -116,14 +116,13 @@ def static_transform(
     )
 
 
-def _tip(model: Any) -> Array:
+def _tip(source: Any) -> Array:
     """(4, 4) of the tip link in the last joint's frame, as described."""
-    if model.source is None:
+    if source is None:
         return np.eye(4)
-    source = dict(model.source)
     joints, locked = joints_of(source["text"]), source["locked"]
     chain = list(walk(source["text"], source["base"], source["tip"], locked))
-    return np.asarray(table_of(chain, joints, locked, source)["tool"])
+    return np.asarray(table_of(chain, joints, locked, {})["tool"])
 
 
 def to_transform(
@@ -158,7 +157,17 @@ def to_transform(
 
 def _text(form: str, pose: StaticTransform) -> str:
     if form == ".urdf":
-        return _urdf(pose)
+        if pose.source is None:
+            raise ValueError(
+                "the arm must come from a URDF file: SerialChain.from_urdf"
+            )
+        text, frame = pose.source["text"], fixed_joint(*pose[:3])
+        one_of("parent", pose.parent, links_of(text))
+        if pose.child in links_of(text):
+            raise ValueError(
+                f"the file already has a link {pose.child}: name another child"
+            )
+        return with_origins(text, {}, frame)
     numbers = [*pose.matrix[:3, 3].tolist(), *pose.quaternion.tolist()]
     keys = ("x", "y", "z", "qx", "qy", "qz", "qw")
     values = {key: repr(float(x)) for key, x in zip(keys, numbers, strict=True)}
@@ -187,15 +196,3 @@ def _text(form: str, pose: StaticTransform) -> str:
         "    )\n"
         "    return LaunchDescription([node])\n"
     )
-
-
-def _urdf(pose: StaticTransform) -> str:
-    if pose.source is None:
-        raise ValueError("the arm must come from a URDF file: SerialChain.from_urdf")
-    text = pose.source["text"]
-    one_of("parent", pose.parent, links_of(text))
-    if pose.child in links_of(text):
-        raise ValueError(
-            f"the file already has a link {pose.child}: name another child"
-        )
-    return with_origins(text, {}, fixed_joint(pose.parent, pose.child, pose.matrix))

@@ -180,13 +180,14 @@ def _name(element: ElementTree.Element, what: str) -> str:
 def _read_joint(element: ElementTree.Element) -> Joint:
     name = _name(element, "joint")
     kind = element.get("type", "none")
-    ends = {}
-    for end in ("parent", "child"):
-        child = element.find(end)
-        link = None if child is None else child.get("link")
+
+    def reference(tag: str, attribute: str) -> str:
+        child = element.find(tag)
+        link = None if child is None else child.get(attribute)
         if not link:
-            raise ValueError(f"joint {name} has no <{end} link=...>")
-        ends[end] = link
+            raise ValueError(f"joint {name} has no <{tag} {attribute}=...>")
+        return link
+
     place = element.find("origin")
     if place is not None and "quat_xyzw" in place.keys():
         raise ValueError(
@@ -202,22 +203,18 @@ def _read_joint(element: ElementTree.Element) -> Joint:
     if _KINDS.get(kind) and not length > 0.0:
         raise ValueError(f"the axis of joint {name} must not be zero")
     mimic = None
-    follows = element.find("mimic")
-    if follows is not None:
-        leader = follows.get("joint")
-        if not leader:
-            raise ValueError(f"joint {name} has no <mimic joint=...>")
+    if element.find("mimic") is not None:
         (times,) = _numbers(element, "mimic", "multiplier", (1.0,), name)
         (plus,) = _numbers(element, "mimic", "offset", (0.0,), name)
-        mimic = (leader, float(times), float(plus))
+        mimic = (reference("mimic", "joint"), float(times), float(plus))
     (low,) = _numbers(element, "limit", "lower", (0.0,), name)
     (high,) = _numbers(element, "limit", "upper", (0.0,), name)
     limited = kind in ("revolute", "prismatic") and low < high
     return Joint(
         name,
         _KINDS.get(kind, kind),
-        ends["parent"],
-        ends["child"],
+        reference("parent", "link"),
+        reference("child", "link"),
         origin,
         axis / (length or 1.0),
         mimic,
@@ -293,17 +290,17 @@ def table_of(
                 f"type of joint {joint.name} must be one of {', '.join(_KINDS)}, "
                 f"got {joint.kind!r}"
             )
-        leader, times, plus = led(joint, joints, locked)
+        lead = led(joint, joints, locked)
         if down:
             frame = frame @ joint.origin
-        if leader is None:
-            stands = moved(joint, plus)
+        if lead[0] is None:
+            stands = moved(joint, lead[2])
             frame = frame @ (stands if down else np.linalg.inv(stands))
         else:
             axis = frame[:3, :3] @ joint.axis
             lines.append((axis if down else -axis, frame[:3, 3]))
             kinds.append(joint.kind)
-            leads.append((leader, times, plus))
+            leads.append(lead)
         if not down:
             frame = frame @ np.linalg.inv(joint.origin)
     if not lines:
@@ -311,35 +308,30 @@ def table_of(
             f"no movable joint between base {source['base']!r} and tip "
             f"{source['tip']!r}"
         )
-    columns = list(dict.fromkeys(leader for leader, _, _ in leads))
-    drive = np.zeros((len(leads), len(columns)))
-    for row, (leader, times, _) in zip(drive, leads, strict=True):
-        row[columns.index(leader)] = times
+    leaders, times, plus = zip(*leads, strict=True)
+    columns = list(dict.fromkeys(leaders))
+    drive = np.equal.outer(leaders, columns) * np.array(times)[:, None]
     limits = [np.array(joints[c].limits) / _unit(joints[c]) for c in columns]
     base = np.eye(4)
-    base[:3, :3] = turn_of_z(lines[0][0])
-    base[:3, 3] = lines[0][1]
-    rows = []
-    reached = base.copy()
+    base[:3, :3], base[:3, 3] = turn_of_z(lines[0][0]), lines[0][1]
+    rows, reached = [], base
     for axis, point in lines[1:]:
-        row = _row(reached, axis, point)
-        rows.append(row)
-        reached = reached @ row_matrix(row)
-    rows.append(np.zeros(5))
+        rows.append(_row(reached, axis, point))
+        reached = reached @ row_matrix(rows[-1])
     return {
-        "table": np.array(rows),
+        "table": np.array([*rows, np.zeros(5)]),
         "joints": "".join(kinds),
         "joint_names": tuple(columns),
         "base": base,
         "tool": np.linalg.inv(reached) @ frame,
         "drive": drive,
-        "offset": np.array([plus for _, _, plus in leads]),
+        "offset": np.array(plus),
         "limits": np.array(limits),
         "source": source,
     }
 
 
-_UR = {  # sections of Universal Robots' file, and the joints that they are of
+UR = {  # sections of Universal Robots' file, and the joints that they are of
     "shoulder": "shoulder_pan_joint",
     "upper_arm": "shoulder_lift_joint",
     "forearm": "elbow_joint",
@@ -355,12 +347,12 @@ def read_ur_kinematics(path: str | os.PathLike[str]) -> dict[str, Any]:
     poses: dict[str, dict[str, float]] = {}
     for line in text.splitlines():
         key, _, value = line.partition("#")[0].strip().partition(":")
-        if key in _UR:
+        if key in UR:
             poses[key] = {}
         elif poses and key in ("x", "y", "z", "roll", "pitch", "yaw"):
             poses[[*poses][-1]][key] = float(value)
     chain = []
-    for link, name in _UR.items():
+    for link, name in UR.items():
         if len(poses.get(link, ())) != 6:
             raise ValueError(
                 f"{os.fspath(path)}: {link} needs x, y, z, roll, pitch, yaw, as in the "
@@ -425,9 +417,8 @@ def _row(frame: Array, axis: Array, point: Array) -> Array:
 def row_matrix(row: Array) -> Array:
     """(4, 4) of a row a, alpha, d, theta, beta at a command of zero."""
     a, alpha, d, theta, beta = row
-    matrix = np.eye(4)
+    matrix, about = np.eye(4), np.radians(theta)
     turn = Rotation.from_euler("ZXY", [theta, alpha, beta], degrees=True)
     matrix[:3, :3] = turn.as_matrix()
-    about = np.radians(theta)
     matrix[:3, 3] = a * np.cos(about), a * np.sin(about), d
     return matrix

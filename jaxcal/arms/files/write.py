@@ -23,6 +23,7 @@ from jaxcal.arms.arguments import pose_matrix
 from jaxcal.arms.arm import Arm
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.files.urdf import (
+    UR,
     Joint,
     joints_of,
     led,
@@ -38,7 +39,6 @@ from jaxcal.checks import Array, one_of
 from jaxcal.files import write_over
 from jaxcal.models.model import as_parameters
 
-_UR = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _TAG = re.compile(rb"""(?:[^>"']+|"[^"]*"|'[^']*')*>""")
 _SAME = 1e-13  # metres and radians: no correction
 _AGREE = 1e-9  # metres and radians: the same correction
@@ -194,7 +194,6 @@ def fixed_joint(parent: str, child: str, matrix: Array) -> str:
 
 def _dh_text(calibrated: Arm) -> str:
     """The table as CSV: joint, a, alpha, d, theta (with the offset), beta."""
-    lines = ["joint,a,alpha,d,theta,beta"]
     names, others = _moved_by(calibrated)
     if others:
         warnings.warn(
@@ -203,9 +202,11 @@ def _dh_text(calibrated: Arm) -> str:
     table = calibrated.table.copy()
     at = [3 if kind == "R" else 2 for kind in calibrated.joints]  # theta or d
     table[range(len(at)), at] += calibrated.offset
-    for name, row in zip(names, table, strict=True):
-        lines.append(",".join([name, *(repr(float(value)) for value in row)]))
-    return "\n".join(lines) + "\n"
+    rows = [
+        ",".join([name, *map(repr, row)])
+        for name, row in zip(names, table.tolist(), strict=True)
+    ]
+    return "\n".join(["joint,a,alpha,d,theta,beta", *rows, ""])
 
 
 def _moved_by(arm: Arm) -> tuple[list[str], list[str]]:
@@ -254,14 +255,12 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
             frames.append(before @ row_matrix(np.array([0.0, 0.0, d, theta, 0.0])))
             before = row_matrix(row * [1.0, 1.0, 0.0, 0.0, 1.0])
     lines = ["kinematics:"]
-    for name, frame, zero in zip(_UR, frames, nominal.offset, strict=True):
+    for name, frame, zero in zip(UR, frames, nominal.offset, strict=True):
         pose = pose_words(frame @ row_matrix(np.array([0.0, 0.0, 0.0, zero, 0.0])))
         values = [*pose["xyz"].split(), *pose["rpy"].split()]
-        lines.append(f"  {name}:")
-        for key, value in zip(
-            ("x", "y", "z", "roll", "pitch", "yaw"), values, strict=True
-        ):
-            lines.append(f"    {key}: {value}")
+        keys = ("x", "y", "z", "roll", "pitch", "yaw")
+        pairs = zip(keys, values, strict=True)
+        lines += [f"  {name}:", *(f"    {key}: {value}" for key, value in pairs)]
     lines.append("  hash: calibrated_by_jaxcal")
     return "\n".join(lines) + "\n"
 

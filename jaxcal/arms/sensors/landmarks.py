@@ -49,9 +49,8 @@ class Landmarks(Sensor):
 
     @property
     def names(self) -> tuple[str, ...]:
-        numbered = [f"{self.kind}{i}" for i in range(self.count)]
-        each = numbered if self.count > 1 else [self.kind]
-        return tuple(f"{name} {axis}" for name in each for axis in self.axes)
+        numbers = range(self.count) if self.count > 1 else [""]
+        return tuple(f"{self.kind}{i} {axis}" for i in numbers for axis in self.axes)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -186,12 +185,10 @@ class Plane(Landmarks):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.places is not None:
-            size = np.linalg.norm(self.places[:, :3], axis=1)
+            size = np.linalg.norm(self.places[:, :3], axis=1, keepdims=True)
             if not (size > 0.0).all():
                 raise ValueError("planes must have normals other than zero")
-            places = np.column_stack(
-                [self.places[:, :3] / size[:, None], self.places[:, 3]]
-            )
+            places = np.hstack([self.places[:, :3] / size, self.places[:, 3:]])
             object.__setattr__(self, "places", places)
 
     @property

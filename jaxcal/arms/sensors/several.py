@@ -97,11 +97,8 @@ class Several(Sensor):
 
     @property
     def nominal(self) -> Array:
-        parts = [
-            np.concatenate([self._mounting(i), one.nominal])
-            for i, one in enumerate(self.sensors)
-        ]
-        return np.concatenate(parts)
+        both = [[self._mounting(i), one.nominal] for i, one in enumerate(self.sensors)]
+        return np.concatenate([part for pair in both for part in pair])
 
     def _axes(self, i: int) -> tuple[str, ...]:
         """Unknown shifts and turns of sensor ``i`` on the tool, where it is mounted."""
@@ -109,11 +106,9 @@ class Several(Sensor):
 
     def _mounting(self, i: int) -> Array:
         """Nominal shifts, and turns of zero, of where sensor ``i`` is on the tool."""
-        if not self._axes(i):
-            return np.zeros(0)
         shift = np.asarray(self.mounts)[i - 1, :3, 3]
         whole = dict(zip(AXES, [*shift, 0.0, 0.0, 0.0], strict=True))
-        return np.array([whole[axis] for axis in self.sensors[i].tool])
+        return np.array([whole[axis] for axis in self._axes(i)])
 
     def prior_std(self, length: float) -> Array:
         mounting = {"r": 1.7, "": 0.1 * length}  # as the tool's
