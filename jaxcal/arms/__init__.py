@@ -5,7 +5,7 @@ Loaded where an arm is asked for; nothing else of jaxcal loads it.
 
 from jaxcal.arms.chain import SerialChain
 from jaxcal.arms.chains import Chains
-from jaxcal.arms.files.servos import Servos
+from jaxcal.arms.files.recordings import Servos
 from jaxcal.arms.sensors import (
     Board,
     Distance,

@@ -82,7 +82,7 @@ class SerialChain(Arm, Model):
     recorded = late("jaxcal.arms.files.recordings:recorded")
     write = late("jaxcal.arms.files.write:write")
     standing_as = late("jaxcal.arms.files.write:standing_as")
-    write_servos = late("jaxcal.arms.files.servos:write_servos")
+    write_servos = late("jaxcal.arms.files.recordings:write_servos")
 
     @classmethod
     def from_dh(

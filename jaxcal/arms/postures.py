@@ -71,10 +71,10 @@ class Room:
 
 
 def _room_of(
-    floor: float | None,
-    approach: ArrayLike | None,
-    clear: Sequence[ArrayLike],
-    radius: float | None,
+    floor: float | None = None,
+    approach: ArrayLike | None = None,
+    clear: Sequence[ArrayLike] = (),
+    radius: float | None = None,
 ) -> Room | None:
     """Checked; the cone of an approach without its angle is 60 degrees."""
     if radius is not None and not len(clear):
@@ -190,20 +190,18 @@ class ReachableSet:
         distance: Sequence[float] | None = None,
         tilt: float | None = None,
         side: str | None = None,
-        floor: float | None = None,
-        approach: ArrayLike | None = None,
-        clear: Sequence[ArrayLike] = (),
-        radius: float | None = None,
+        **room: Any,
     ) -> None:
         if camera is None and getattr(arm.sensor, "picture", None) is not None:
             camera = arm.sensor.camera  # type: ignore[attr-defined]  # of a Board
         self.view = view_of(arm, camera, distance, tilt, side)
-        self.room = _room_of(floor, approach, clear, radius)
+        self.room = _room_of(**room)
         if arm.sensor.joined:
             raise ValueError("use one sensor at a time: arm.measured_with(sensor)")
         self.near, self.allowed = near, allowed
         self.arm, self.targets = _aimed(arm, near)
         places = getattr(self.arm.sensor, "places", None)
+        floor = self.room.floor if self.room else None
         if floor is not None and isinstance(arm.sensor, Socket) and places is not None:
             for i in np.flatnonzero(places[:, 2] < floor - _SUNK * arm.length)[:1]:
                 raise ValueError(

@@ -3,9 +3,8 @@
 from jaxcal.arms.sensors.at_rest import Gravity, Wrench
 from jaxcal.arms.sensors.board import Board
 from jaxcal.arms.sensors.landmarks import Distance, Flush, Landmarks, Plane, Socket
-from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip, hats
+from jaxcal.arms.sensors.sensor import Pose, Position, Reading, Sensor, Tip, hats
 from jaxcal.arms.sensors.several import Several
-from jaxcal.arms.sensors.trackers import Pose, Position
 
 __all__ = [
     "SENSORS",

@@ -71,9 +71,7 @@ class Gravity(AtRest):
     def quantities(self) -> tuple[Quantity, ...]:
         return (Quantity("g" if self.magnitude == 1.0 else "m/s^2"),)
 
-    @property
-    def nominal(self) -> Array:
-        return np.array([1.0, 0.0, 0.0, 0.0])
+    nominal = np.array([1.0, 0.0, 0.0, 0.0])
 
     def prior_std(self, length: float) -> Array:
         return np.array([0.02, *[0.05 * self.magnitude] * 3])

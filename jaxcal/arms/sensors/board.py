@@ -9,8 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from jaxcal.arms.sensors.sensor import AXES, BASE, Reading, Sensor, Tip, hats, turns
-from jaxcal.arms.sensors.trackers import Pose, rotation_vector_rate
+from jaxcal.arms.sensors.sensor import (
+    AXES,
+    BASE,
+    Pose,
+    Reading,
+    Sensor,
+    Tip,
+    hats,
+    rotation_vector_rate,
+    turns,
+)
 from jaxcal.checks import Array, array_of, numbers, one_of
 from jaxcal.models.model import Quantity
 
