@@ -19,7 +19,12 @@ from jaxcal.checks import Array
 from jaxcal.models.uncertainty import Prior
 
 if TYPE_CHECKING:
-    from jaxcal.arms.verdict import ArmFit as Fit
+    from jaxcal.calibration import Calibration
+
+    class Fit(Calibration):
+        """A calibration of an arm, or of several."""
+
+        model: Chain
 
 
 SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that

@@ -14,7 +14,7 @@ from jaxcal.calibration.verdict import Reason, outlying
 from jaxcal.checks import Array
 
 if TYPE_CHECKING:
-    from jaxcal.arms.verdict import ArmFit as Fit
+    from jaxcal.arms.effects import Fit
 
 
 MORE = "measure more postures: jaxcal postures --measured chooses them"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,18 +32,7 @@ from jaxcal.checks import Array
 from jaxcal.information.singular import depends, significant
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
-
-    class ArmFit(Calibration):
-        """A calibration of an arm, or of several."""
-
-        model: Chain
-
-        def again(self, *given: Any) -> ArmFit: ...
-
-        @property
-        def verdict(self) -> ArmVerdict: ...
-
+    from jaxcal.arms.effects import Fit
 
 _LOOK = (
     "look at the residuals (report, --report); use the nominal machine until they are "
@@ -155,7 +144,7 @@ def _missed(
     return [one for one in errors if one.interval[1] > asked.get(one.unit, np.inf)]
 
 
-def verdict(model: Chain, calibration: ArmFit) -> ArmVerdict:
+def verdict(model: Chain, calibration: Fit) -> ArmVerdict:
     """Does its model explain the readings, does it help, what is wrong.
 
     Held-out errors with an interval beside those of the nominal arm, the scatter
@@ -256,7 +245,7 @@ class Place(NamedTuple):
         return " and ".join(shown) or "nothing"
 
 
-def place_of(calibration: ArmFit, names: Sequence[str]) -> Place:
+def place_of(calibration: Fit, names: Sequence[str]) -> Place:
     """How well six shifts and turns are known.
 
     Hidden are those in directions of which the readings leave half of what is usual of
@@ -277,7 +266,7 @@ def place_of(calibration: ArmFit, names: Sequence[str]) -> Place:
     return Place((float(std[0]), float(std[1])), named)
 
 
-def _sessions(calibration: ArmFit, first: HeldOut) -> str:
+def _sessions(calibration: Fit, first: HeldOut) -> str:
     """How sessions differ, in a sentence."""
     of_sessions = calibration.provenance.get("sessions")
     if of_sessions is None:
@@ -330,7 +319,7 @@ def _mean(errors: Array) -> tuple[float, float]:
     return float(errors.mean()), float(half_width)
 
 
-def _nominal(calibration: ArmFit, used: NDArray[np.intp], parts: list[Part]) -> Array:
+def _nominal(calibration: Fit, used: NDArray[np.intp], parts: list[Part]) -> Array:
     """(N, q) errors of the nominal arm, of the rows ``used``."""
     commands, measured = calibration.commands[used], calibration.measured[used]
     model, off = calibration.model, np.zeros_like(calibration.residuals)
@@ -343,7 +332,7 @@ def _nominal(calibration: ArmFit, used: NDArray[np.intp], parts: list[Part]) -> 
 
 
 def _in_units(
-    calibration: ArmFit, part: Part, held_out: Array, off: Array
+    calibration: Fit, part: Part, held_out: Array, off: Array
 ) -> Iterator[HeldOut]:
     """A part's mean errors, those of each unit by themselves."""
     unit = calibration.measured_unit
@@ -358,7 +347,7 @@ def _in_units(
         yield HeldOut(part.title, quantity.unit, mean, interval, nominal)
 
 
-def _scattered(calibration: ArmFit, usual: Array, parts: list[Part]) -> Reason | None:
+def _scattered(calibration: Fit, usual: Array, parts: list[Part]) -> Reason | None:
     """Readings that scatter by more than the noise explains."""
     if calibration.noise_known:
         return wrong_noise(calibration)
@@ -377,9 +366,7 @@ def _scattered(calibration: ArmFit, usual: Array, parts: list[Part]) -> Reason |
     )
 
 
-def _anywhere(
-    calibration: ArmFit, model: Chain, parts: list[Part]
-) -> tuple[Part, float]:
+def _anywhere(calibration: Fit, model: Chain, parts: list[Part]) -> tuple[Part, float]:
     """The first part whose readings are positions, and the standard deviation of the
     tip's position at postures of any kind, beside a shift and a turn of the whole arm.
 

@@ -7,7 +7,7 @@ import functools
 import os
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,7 +203,7 @@ class Calibration(Fit):
 
     def again(
         self, model: Any, prior: Prior | None, rows: NDArray[np.bool_] | None = None
-    ) -> Calibration:
+    ) -> Self:
         """The calibration by another model of the machine and a prior, None: as of
         ``identify``; of the same readings, or of some ``rows`` (N,) of them."""
         used = self.loss_weights > 0.0

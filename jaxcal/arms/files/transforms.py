@@ -18,7 +18,7 @@ from jaxcal.files import write_over
 from jaxcal.models.uncertainty import Prior
 
 if TYPE_CHECKING:
-    from jaxcal.arms.verdict import ArmFit as Calibration
+    from jaxcal.arms.effects import Fit as Calibration
 
 
 _FORMS = (".yaml", ".yml", ".sh", ".py", ".urdf")
@@ -103,7 +103,8 @@ def static_transform(
     # The arm's own errors are no noise of the views: the whole fit knows them.
     places = [place_of(fit, names) for fit in (again, calibration)]
     std = np.max([place.std for place in places], axis=0) * [scale, 1.0]
-    off = " and ".join(one.says(one.held_out) for one in again.verdict.errors)
+    verdict: Any = again.verdict
+    off = " and ".join(one.says(one.held_out) for one in verdict.errors)
     end = "tip" if sensor.moves == "camera" else "base"
     return StaticTransform(
         parent or (source[end] if source else end),
