@@ -510,21 +510,17 @@ class SerialChain(Arm, Model):
     def predict(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        commands = as_commands(self, commands)
-        parameters = as_parameters(self, parameters)
-        return self._reading(commands, parameters).values.copy()
+        commands, theta = as_commands(self, commands), as_parameters(self, parameters)
+        return self._reading(commands, theta).values.copy()
 
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        commands = as_commands(self, commands)
-        parameters = as_parameters(self, parameters)
-        columns, by_sensor = self._motion(
-            commands, parameters, self._steps_of_parameters
-        )
+        commands, theta = as_commands(self, commands), as_parameters(self, parameters)
+        columns, by_sensor = self._motion(commands, theta, self._steps_of_parameters)
         first = 5 * len(self.joints)
         last = first + len(self.gears)
-        swing, goes = self._swing(commands, parameters)
+        swing, goes = self._swing(commands, theta)
         if self.gears:
             at = [i - 1 for i in self.gears]
             moves = self._moves(commands)[:, at] * goes[at].T
@@ -532,9 +528,8 @@ class SerialChain(Arm, Model):
         if self.compliance:
             torque = self._torque(commands).T
             columns[..., last : last + len(self.compliance)] *= torque[:, None]
-        columns, waves = np.split(
-            columns, [columns.shape[-1] - self.waves.size], axis=-1
-        )
+        end = columns.shape[-1] - self.waves.size
+        columns, waves = np.split(columns, [end], axis=-1)
         waves *= swing.reshape(self.waves.size, len(commands)).T[:, None]
         return np.concatenate([columns, by_sensor, waves], axis=-1)
 
@@ -543,11 +538,10 @@ class SerialChain(Arm, Model):
     ) -> Array:
         """(N, q, n), zero by the sensor's columns; of a pose, with the orientation that
         it is compared with held."""
-        commands = as_commands(self, commands)
-        parameters = as_parameters(self, parameters)
-        columns, _ = self._motion(commands, parameters, self._steps_of_joints)
-        gears, compliance, _ = self._drives(parameters)
-        result = columns * gears * self._swing(commands, parameters)[1].T[:, None]
+        commands, theta = as_commands(self, commands), as_parameters(self, parameters)
+        columns, _ = self._motion(commands, theta, self._steps_of_joints)
+        gears, compliance, _ = self._drives(theta)
+        result = columns * gears * self._swing(commands, theta)[1].T[:, None]
         if self.compliance:
             at = [i - 1 for i in self.compliance]
             rate = compliance[:, None, None] * self._torque_slopes(commands)

@@ -551,21 +551,19 @@ class Chains(Model):
             null = null[:, at]
             null = null[np.abs(null).max(axis=1, initial=0.0) > 0.0]
         joint = fit.joint_covariance
+        by_parameter = ("estimate", "prior_mean", "prior_precision", "free")
+        by_row = ("loss_weights", "distance")
         return {
+            **{name: getattr(fit, name)[at] for name in by_parameter},
+            **{name: getattr(fit, name)[rows] for name in by_row},
             "model": arm,
             "input_names": (*arm.joint_names, *arm.sensor.inputs),
             "output_names": tuple(arm.sensor.outputs),
-            "estimate": fit.estimate[at],
             "joint_covariance": None if joint is None else joint[np.ix_(at, at)],
             "unidentified": null if null is not None and len(null) else None,
-            "prior_mean": fit.prior_mean[at],
-            "prior_precision": fit.prior_precision[at],
-            "free": fit.free[at],
             "commands": fit.commands[rows][:, self._columns[k]],
             "estimated_commands": None,
             "residuals": residuals,
-            "loss_weights": fit.loss_weights[rows],
-            "distance": fit.distance[rows],
             "dof": max(fit.dof * share, 0.0),
             "square": square,
             "num_readings": float(q),

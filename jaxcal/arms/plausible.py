@@ -128,10 +128,9 @@ def _require_of_sensor(arm: Chain, commands: Array, measured: Array) -> None:
         _require_in_picture(arm.sensor, measured, arm.length or 1.0)
     if not arm.sensor.positions:
         return
-    spread = []
-    for points in (measured[:, :3], arm.predict(commands)[:, :3]):
-        apart = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-        spread.append(float(np.median(apart)))
+    points = np.array([measured[:, :3], arm.predict(commands)[:, :3]])
+    apart = points - np.median(points, axis=1, keepdims=True)
+    spread = np.median(np.linalg.norm(apart, axis=2), axis=1)
     if max(spread) > max(10.0 * min(spread), 0.01 * arm.length):
         raise ValueError(
             "measured must be in the model's unit of length and commands in degrees: "

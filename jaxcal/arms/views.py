@@ -80,14 +80,10 @@ def view_of(
     return View(lens, (low, high), float(tilt), known_side)
 
 
-def _board_of(arm: Chain) -> Board:
-    """The sensor of an arm that sees, or is, a board."""
-    return cast(Board, arm.sensor)
-
-
-def _posed(arm: Chain) -> Chain:
-    """The arm whose board is seen as poses."""
-    return arm.measured_with(dataclasses.replace(_board_of(arm), corners=None))
+def _posed(arm: Chain) -> tuple[Board, Chain]:
+    """The board of an arm, and the arm with it seen as poses."""
+    board = cast(Board, arm.sensor)
+    return board, arm.measured_with(dataclasses.replace(board, corners=None))
 
 
 def seen_by(arm: Chain, commands: Array) -> tuple[Array, Array, Array]:
@@ -95,8 +91,9 @@ def seen_by(arm: Chain, commands: Array) -> tuple[Array, Array, Array]:
     (N, 3, 3) of the board in the camera."""
     joints = commands[:, : arm.num_joints]
     # Of a board seen at zero: its pose in the camera.
-    pose = _posed(arm).predict(np.hstack([joints, np.zeros((len(joints), 6))]))
-    if _board_of(arm).corners is None:
+    board, posed = _posed(arm)
+    pose = posed.predict(np.hstack([joints, np.zeros((len(joints), 6))]))
+    if board.corners is None:
         commands = np.hstack([joints, pose])
     turn = Rotation.from_rotvec(pose[:, 3:], degrees=True).as_matrix()
     return commands, pose[:, :3], turn
@@ -124,7 +121,8 @@ def aimed(
 ) -> Array:
     """Commands towards poses of the board in the camera that are drawn."""
     j, count = arm.num_joints, len(commands)
-    middle = _board_of(arm).outline.mean(axis=0)
+    board, posed = _posed(arm)
+    middle = board.outline.mean(axis=0)
     width, height, fx, fy, cx, cy = view.camera
     far = rng.uniform(*view.ends, count)
     aim = rng.uniform(0.25, 0.75, (count, 2)) * [width, height]
@@ -142,13 +140,13 @@ def aimed(
     shift = centre - turn.apply(np.tile(middle, (count, 1)))
     goals = np.hstack([commands[:, :j], shift, turn.as_rotvec(degrees=True)])
     unit = np.array([1.0 / (arm.length or 1.0)] * 3 + [np.radians(1.0)] * 3)
-    moved = towards_zero(_posed(arm), goals, low, high, 1e-2, unit)
+    moved = towards_zero(posed, goals, low, high, 1e-2, unit)
     return np.hstack([moved[:, :j], commands[:, j:]])
 
 
 def in_picture(arm: Chain, commands: Array, view: View) -> tuple[Array, list[str]]:
     """Commands with what the camera sees of the board, and why it is of no use."""
-    sensor = _board_of(arm)
+    sensor = cast(Board, arm.sensor)
     width, height, fx, fy, cx, cy = view.camera
     commands, place, rotation = seen_by(arm, commands)
     spots = sensor.outline @ np.matrix_transpose(rotation) + place[:, None]

@@ -201,8 +201,6 @@ class Sensor(abc.ABC):
         """Whether all that is measured is zero."""
         return all(one.zeros for one in self.members)
 
-    # -- the sensors that it consists of: itself, but of Several -----------------------
-
     @property
     def members(self) -> tuple[Sensor, ...]:
         """Sensors with things of their own."""
