@@ -63,9 +63,9 @@ class Part(NamedTuple):
         return np.asarray(np.isin(pairs, labels).all(axis=1))
 
 
-def parts_of(calibration: Fit, used: NDArray[np.intp]) -> list[Part]:
+def parts_of(fit: Fit, used: NDArray[np.intp]) -> list[Part]:
     """Readings of each sensor that has some."""
-    model, commands = calibration.model, calibration.commands[used]
+    model, commands = fit.model, fit.commands[used]
     tip, inputs = model.nominal_tip(commands), commands[:, model.num_joints :]
     kinds, parts = [one.kind for one in model.sensor.members], []
     for i, read in enumerate(model.sensor.of_members(tip, inputs, None)):
@@ -78,9 +78,9 @@ def parts_of(calibration: Fit, used: NDArray[np.intp]) -> list[Part]:
     return [parts[0]._replace(title="")] if len(parts) == 1 else parts
 
 
-def unit_after(calibration: Fit) -> str:
+def unit_after(fit: Fit) -> str:
     """The unit of lengths after a number, where it is known."""
-    unit = calibration.model.length_unit(calibration.measured_unit)
+    unit = fit.model.length_unit(fit.measured_unit)
     return f" {unit}" if unit else ""
 
 
@@ -97,7 +97,7 @@ class Findings(NamedTuple):
 
 
 def findings_of(
-    calibration: Fit,
+    fit: Fit,
     used: NDArray[np.intp],
     parts: list[Part],
     scatter: Reason | None,
@@ -111,34 +111,34 @@ def findings_of(
     columns, ``anywhere`` the tip's standard deviation, ``nominal`` its error as
     described.
     """
-    model = calibration.model
+    model = fit.model
     swapped: dict[int, int] = {}
     for part in parts:
-        swapped |= _swapped(calibration, part, scatter is None)
-    exchanged = [line for part in parts for line in _exchanged(calibration, part)]
+        swapped |= _swapped(fit, part, scatter is None)
+    exchanged = [line for part in parts for line in _exchanged(fit, part)]
     limit = _LOOSE if len(used) > _SPARSE else 0.0
-    of_noise = scatter is not None and calibration.noise_known  # all rows are far off
-    outliers = [] if of_noise else [*calibration.outliers]
-    far = (calibration.distance[outliers] > limit**2).any()
+    of_noise = scatter is not None and fit.noise_known  # all rows are far off
+    outliers = [] if of_noise else [*fit.outliers]
+    far = (fit.distance[outliers] > limit**2).any()
     contradicting: tuple[int, ...] = ()
-    reasons = _wrong_rows(calibration, used, parts, swapped, outliers)
+    reasons = _wrong_rows(fit, used, parts, swapped, outliers)
     if scatter:
         reasons.insert(0, scatter.fact)
     if swapped or exchanged or far:
         reasons.insert(0, "some readings contradict the others")
         contradicting = tuple(sorted({*swapped, *outliers}))
-    moved = {part.kind: _moved(calibration, part, swapped) for part in parts}
+    moved = {part.kind: _moved(fit, part, swapped) for part in parts}
     moved_lines = [line for lines in moved.values() for line in lines]
-    tip, doubtful = _other_tip(calibration, model)
-    other_arm = [] if mistaken else _other_links(calibration, parts)
+    tip, doubtful = _other_tip(fit, model)
+    other_arm = [] if mistaken else _other_links(fit, parts)
     apart, wrong = (
-        ([], False) if other_arm else other_distances(calibration, parts, model.length)
+        ([], False) if other_arm else other_distances(fit, parts, model.length)
     )
-    still, unused = _still(model, calibration.commands[used])
-    reasons += moved_lines + exchanged + _far(calibration)
-    reasons += tip + other_arm + apart + still + _kept(calibration)
+    still, unused = _still(model, fit.commands[used])
+    reasons += moved_lines + exchanged + _far(fit)
+    reasons += tip + other_arm + apart + still + _kept(fit)
     reasons += [
-        f"The readings show a mass of {calibration.parameters[part.own][0]:.3g} kg. If "
+        f"The readings show a mass of {fit.parameters[part.own][0]:.3g} kg. If "
         "the controller subtracts a payload, this is the load less that payload: set "
         "the payload to zero, or add what is subtracted."
         for part in parts
@@ -146,7 +146,7 @@ def findings_of(
     ]
     doubtful |= wrong or unused or mistaken != ""
     doubtful |= bool(contradicting or exchanged or other_arm)
-    vague = left_open(parts, unit_after(calibration), anywhere, nominal)
+    vague = left_open(parts, unit_after(fit), anywhere, nominal)
     reasons += [vague.fact] if vague else []
     return Findings(
         # What the fit made of mistaken columns is no reason.
@@ -183,14 +183,14 @@ def left_open(
 
 
 def _wrong_rows(
-    calibration: Fit,
+    fit: Fit,
     used: NDArray[np.intp],
     parts: list[Part],
     swapped: dict[int, int],
     outliers: list[int],
 ) -> list[str]:
     """Rows of another socket, outliers, and contacts that were written twice."""
-    commands = calibration.commands
+    commands = fit.commands
     kinds = {row: part.kind for part in parts for row in part.rows.tolist()}
     touching = {row: p.sensor.zeros for p in parts for row in p.rows.tolist()}
     said = [
@@ -198,21 +198,21 @@ def _wrong_rows(
         for row, other in sorted(swapped.items())
     ]
     loose = [row for row in outliers if row not in swapped]
-    if reason := outlying(calibration, loose):
+    if reason := outlying(fit, loose):
         said.append(reason.fact)
-    for doubled in np.flatnonzero(calibration.loss_weights == 0.0):
+    for doubled in np.flatnonzero(fit.loss_weights == 0.0):
         same = (commands[used] == commands[doubled]).all(axis=1)
         if same.any() and touching[used[same][0]]:
             said.append(f"measurement {doubled} repeats {used[same][0]}, counted once")
     return said
 
 
-def _far(calibration: Fit) -> list[str]:
+def _far(fit: Fit) -> list[str]:
     """Parameters that were found far from what was known of them."""
-    names = calibration.names
+    names = fit.names
     p = len(names)
-    off = np.abs(calibration.parameters - calibration.prior_mean[:p])
-    off = off * np.sqrt(calibration.prior_precision[:p]) * calibration.free[:p]
+    off = np.abs(fit.parameters - fit.prior_mean[:p])
+    off = off * np.sqrt(fit.prior_precision[:p]) * fit.free[:p]
     return [
         f"{names[i]} is {off[i]:.2g} standard deviations from its prior: is the tip, "
         "file or unit wrong?"
@@ -220,12 +220,12 @@ def _far(calibration: Fit) -> list[str]:
     ]
 
 
-def _kept(calibration: Fit) -> list[str]:
+def _kept(fit: Fit) -> list[str]:
     """Shifts of the tool that contacts do not show."""
-    sensor, names = calibration.model.sensor.members[0], calibration.names
+    sensor, names = fit.model.sensor.members[0], fit.names
     if not sensor.zeros or sensor.views:
         return []
-    shown = dict(zip(names, np.asarray(calibration.from_data), strict=True))
+    shown = dict(zip(names, np.asarray(fit.from_data), strict=True))
     kept = [name for name in names if name[:-1] == "tool " and shown[name] < _SHOWN]
     if not kept:
         return []
@@ -235,44 +235,44 @@ def _kept(calibration: Fit) -> list[str]:
     ]
 
 
-def _other_tip(calibration: Fit, model: Chain) -> tuple[list[str], bool]:
+def _other_tip(fit: Fit, model: Chain) -> tuple[list[str], bool]:
     """A tip far from where the arm's description has it, and whether that is in doubt:
     it is farther off than the prior allowed."""
     if not model.sensor.members[0].zeros:  # the others' places on the tool are loose
         return [], False
-    names = calibration.names
+    names = fit.names
     if "tool rx" in names:  # where a camera or board is on the tip is asked for
         return [], False
     at = [names.index(f"tool {axis}") for axis in "xyz" if f"tool {axis}" in names]
-    moved = calibration.parameters[at] - model.nominal[at]
-    variance = moved @ np.asarray(calibration.covariance)[np.ix_(at, at)] @ moved
+    moved = fit.parameters[at] - model.nominal[at]
+    variance = moved @ np.asarray(fit.covariance)[np.ix_(at, at)] @ moved
     far = float(np.linalg.norm(moved))
     if far**2 - 2.0 * np.sqrt(variance) <= _TIP * model.length * far:
         return [], False
     std = float(np.sqrt(variance)) / far
-    allowed = 2.0 / np.sqrt(calibration.prior_precision[at].max() + 1e-300)
+    allowed = 2.0 / np.sqrt(fit.prior_precision[at].max() + 1e-300)
     by = ", ".join(f"{shift:.3g}" for shift in moved)
     return [
-        f"the tip is {far:.3g}{unit_after(calibration)} from its place in the arm's "
+        f"the tip is {far:.3g}{unit_after(fit)} from its place in the arm's "
         f"description (tool {by}), uncertainty {std:.2g}: is it another tip?"
     ], bool(far > allowed)
 
 
 def other_distances(
-    calibration: Fit, parts: list[Part], length: float
+    fit: Fit, parts: list[Part], length: float
 ) -> tuple[list[str], bool]:
     """Distances that were given and that the contacts contradict; by much or not.
 
     Each that seems so, to first order, is freed: the readings are fitted without it.
     """
-    said, most, unit = [], 0.0, unit_after(calibration)
+    said, most, unit = [], 0.0, unit_after(fit)
     for part in parts:
         distances = getattr(part.sensor, "distances", ())
         if not len(distances):
             continue
-        off, rows = _facts(calibration, part)
-        _, facts = calibration.model.facts(calibration.parameters)
-        spread = rows @ _at_these_sizes(calibration, facts)
+        off, rows = _facts(fit, part)
+        _, facts = fit.model.facts(fit.parameters)
+        spread = rows @ _at_these_sizes(fit, facts)
         share = np.minimum((spread * rows).sum(axis=1), 1.0 - 1e-9)
         change = np.array(distances)[:, 3] * np.abs(off) / (1.0 - share)
         doubtful = np.abs(off) > _APART * np.sqrt(1.0 - share)
@@ -282,7 +282,7 @@ def other_distances(
             doubtful &= ~part.judged
         for k in np.flatnonzero(doubtful).tolist():
             first, second, distance, std = distances[k]
-            free, free_std = _freed(calibration, part, k)
+            free, free_std = _freed(fit, part, k)
             change[k] = abs(free - distance)
             sure = change[k] > _APART * np.hypot(free_std, std)
             if not sure or change[k] < _SHORT * length:
@@ -296,42 +296,42 @@ def other_distances(
     return said, most > _WRONG * length
 
 
-def _facts(calibration: Fit, part: Part) -> tuple[Array, Array]:
+def _facts(fit: Fit, part: Part) -> tuple[Array, Array]:
     """What is known of a sensor's things: (F,) off, (F, p) derivative."""
-    off, own = part.sensor.facts(calibration.parameters[part.own])
-    rows = np.zeros((len(off), len(calibration.names)))
+    off, own = part.sensor.facts(fit.parameters[part.own])
+    rows = np.zeros((len(off), len(fit.names)))
     rows[:, part.own] = own
     return off, rows
 
 
-def _freed(calibration: Fit, part: Part, row: int) -> tuple[float, float]:
+def _freed(fit: Fit, part: Part, row: int) -> tuple[float, float]:
     """A given distance as the readings have it without it, and its deviation."""
-    model, touched = calibration.model, part.touched()
+    model, touched = fit.model, part.touched()
     touched[row] = False
     sensor: Any = part.sensor
     distances = sensor.distances
     rest = [one for one, kept in zip(distances, touched, strict=True) if kept]
     free = model.with_member(part.member, dataclasses.replace(sensor, distances=rest))
-    fit = calibration.again(free, calibration.stated_prior)
+    again = fit.again(free, fit.stated_prior)
     _, _, distance, std = distances[row]
-    if fit.covariance is None:  # too few readings to tell the noise without it
+    if again.covariance is None:  # too few readings to tell the noise without it
         return distance, np.inf
-    off, rows = _facts(fit, part)
-    variance = rows[row] @ fit.covariance @ rows[row]
+    off, rows = _facts(again, part)
+    variance = rows[row] @ again.covariance @ rows[row]
     return distance - std * off[row], std * float(np.sqrt(variance))
 
 
-def _at_these_sizes(calibration: Fit, facts: Array) -> Array:
+def _at_these_sizes(fit: Fit, facts: Array) -> Array:
     """(p, p) covariance of the parameters by the readings and ``facts`` (F, p) alone,
     the sizes of the arm's errors held."""
-    used = np.flatnonzero(calibration.loss_weights > 0.0)
-    theta = calibration.parameters
-    slopes = np.asarray(calibration.model.jacobian(calibration.commands[used], theta))
-    weight = np.sqrt(np.minimum(calibration.loss_weights[used], 1.0))[:, None, None]
-    rows = weight * slopes / np.asarray(calibration.noise_std)[:, None]
+    used = np.flatnonzero(fit.loss_weights > 0.0)
+    theta = fit.parameters
+    slopes = np.asarray(fit.model.jacobian(fit.commands[used], theta))
+    weight = np.sqrt(np.minimum(fit.loss_weights[used], 1.0))[:, None, None]
+    rows = weight * slopes / np.asarray(fit.noise_std)[:, None]
     rows = np.vstack([rows.reshape(-1, len(theta)), facts])
-    free = np.flatnonzero(calibration.free[: len(theta)])
-    precision = calibration.prior_precision[free]
+    free = np.flatnonzero(fit.free[: len(theta)])
+    precision = fit.prior_precision[free]
     information = rows[:, free].T @ rows[:, free] + np.diag(precision)
     scale = 1.0 / np.sqrt(information.diagonal() + 1e-300)
     inverse = np.linalg.pinv(
@@ -356,12 +356,12 @@ def _still(model: Chain, commands: Array) -> tuple[list[str], bool]:
     return said, bool((joints[0, still] == 0.0).any())
 
 
-def _other_links(calibration: Fit, parts: list[Part]) -> list[str]:
+def _other_links(fit: Fit, parts: list[Part]) -> list[str]:
     """Lengths and zeros far from the arm's description, if a prior allowed that."""
-    model = calibration.model
+    model = fit.model
     names, units = np.array(model.names), np.array(model.units)
-    off = np.abs(calibration.parameters - model.nominal)
-    std = np.asarray(calibration.standard_errors)
+    off = np.abs(fit.parameters - model.nominal)
+    std = np.asarray(fit.standard_errors)
     sure = np.where(np.isfinite(std), off - 2.0 * std, 0.0)[: model.table.size]
     lengths = units[: model.table.size] == "length"
     far = np.flatnonzero(lengths & (sure > _LINK * model.length))
@@ -370,7 +370,7 @@ def _other_links(calibration: Fit, parts: list[Part]) -> list[str]:
     if far.size and not tracked:
         reasons.append(
             f"{', '.join(names[far])}: up to {off[far].max():.3g}"
-            f"{unit_after(calibration)} from the arm's description. Are the readings "
+            f"{unit_after(fit)} from the arm's description. Are the readings "
             "of another arm, in another unit, of a board of another size, or of "
             "several sockets numbered as one?"
         )
@@ -382,12 +382,12 @@ def _other_links(calibration: Fit, parts: list[Part]) -> list[str]:
     ]
 
 
-def _exchanged(calibration: Fit, part: Part) -> list[str]:
+def _exchanged(fit: Fit, part: Part) -> list[str]:
     """Sockets that were found where others were said to be."""
     sensor = part.sensor
     if not isinstance(sensor, Socket) or sensor.places is None:
         return []
-    places = calibration.parameters[part.own]
+    places = fit.parameters[part.own]
     apart = np.linalg.norm(places.reshape(-1, 1, 3) - sensor.places, axis=-1)
     nearest = apart.argmin(axis=1)
     if len(np.unique(nearest)) < len(nearest):  # one was moved, or the arm is far off
@@ -400,13 +400,13 @@ def _exchanged(calibration: Fit, part: Part) -> list[str]:
     ]
 
 
-def _moved(calibration: Fit, part: Part, swapped: dict[int, int]) -> list[str]:
+def _moved(fit: Fit, part: Part, swapped: dict[int, int]) -> list[str]:
     """Sockets and planes whose first and last contacts lie apart."""
-    reasons, unit, rng = [], unit_after(calibration), np.random.default_rng(0)
+    reasons, unit, rng = [], unit_after(fit), np.random.default_rng(0)
     width = len(part.scale)
     for i, of_one in enumerate(part.groups()):
         rows = of_one[~np.isin(of_one, list(swapped))]
-        residuals = calibration.residuals[rows, :width] * part.scale
+        residuals = fit.residuals[rows, :width] * part.scale
         if len(rows) < 2 * _FEW:
             continue
         gain, at, apart, within = _split(residuals)
@@ -437,20 +437,20 @@ def _split(values: Array) -> tuple[float, int, float, float]:
     return float(gain[best]), int(at[best]), float(apart[best]), float(within)
 
 
-def _swapped(calibration: Fit, part: Part, explains: bool) -> dict[int, int]:
+def _swapped(fit: Fit, part: Part, explains: bool) -> dict[int, int]:
     """Outliers that fit another socket or plane, as if their column were wrong."""
-    model, sensor = calibration.model, part.sensor
+    model, sensor = fit.model, part.sensor
     if not (sensor.zeros and sensor.num_places > 1):
         return {}
-    noise = np.asarray(calibration.noise_std)
-    at = part.rows[np.isin(part.rows, list(calibration.outliers))]
+    noise = np.asarray(fit.noise_std)
+    at = part.rows[np.isin(part.rows, list(fit.outliers))]
     swaps: dict[int, int] = {}
     if at.size:
-        trial = np.repeat(calibration.commands[None, at], sensor.num_places, axis=0)
+        trial = np.repeat(fit.commands[None, at], sensor.num_places, axis=0)
         column = model.num_joints + model.sensor.inputs.index(sensor.inputs[0])
         stated = trial[..., column].copy()
         trial[..., column] = np.arange(sensor.num_places)[:, None]
-        off = np.abs(calibration.predict(trial) / noise).max(axis=-1)
+        off = np.abs(fit.predict(trial) / noise).max(axis=-1)
         for other, row in np.argwhere((off < 4.0) & (stated != trial[..., column])):
             swaps[int(at[row])] = int(other)
     if isinstance(sensor, Socket) and not explains:

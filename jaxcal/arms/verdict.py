@@ -144,52 +144,48 @@ def _missed(
     return [one for one in errors if one.interval[1] > asked.get(one.unit, np.inf)]
 
 
-def verdict(model: Chain, calibration: Fit) -> ArmVerdict:
+def verdict(model: Chain, fit: Fit) -> ArmVerdict:
     """Does its model explain the readings, does it help, what is wrong.
 
     Held-out errors with an interval beside those of the nominal arm, the scatter
     against the sensor's usual noise, and by name what ``findings_of`` finds.
     """
-    unit = calibration.measured_unit
+    unit = fit.measured_unit
     usual, reason = np.asarray(model.default_noise().std), None
-    if calibration.noise_std is None:
-        stds = np.broadcast_to(usual, (calibration.num_outputs,))
+    if fit.noise_std is None:
+        stds = np.broadcast_to(usual, (fit.num_outputs,))
         stds = stds if np.ptp(stds) else stds[:1]
         reason = Reason(
-            calibration.no_noise("intervals and no verdict"),
+            fit.no_noise("intervals and no verdict"),
             "measure more postures, or state noise_std, --noise (usual for this "
             f"sensor: {','.join(f'{std:.2g}' for std in stds)})",
         )
     elif not model.sensor.zeros:
-        reason = never_measured(calibration) or computed(calibration)
+        reason = never_measured(fit) or computed(fit)
     if reason is not None:
         return ArmVerdict(
             good=False, reasons=(reason.fact,), next_step=reason.remedy, unit=unit
         )
-    used = np.flatnonzero(calibration.loss_weights > 0.0)
-    commands, measured = calibration.commands[used], calibration.measured[used]
-    parts = parts_of(calibration, used)
-    held_out, off = left_out(calibration), _nominal(calibration, used, parts)
-    errors = [
-        one for part in parts for one in _in_units(calibration, part, held_out, off)
-    ]
+    used = np.flatnonzero(fit.loss_weights > 0.0)
+    commands, measured = fit.commands[used], fit.measured[used]
+    parts = parts_of(fit, used)
+    held_out, off = left_out(fit), _nominal(fit, used, parts)
+    errors = [one for part in parts for one in _in_units(fit, part, held_out, off)]
     ratio, half = _ratio(held_out[used] / usual, off[used] / usual)
     # Below the nominal arm's; None where not sure.
     helps = ratio < 1.0 or (None if ratio - half < 1.0 else False)
-    scatter = _scattered(calibration, usual, parts)
+    scatter = _scattered(fit, usual, parts)
     explains = scatter is None
     mistaken = ""
     if not explains and errors[0].nominal > _PLAIN * model.length:
         mistaken = mistaken_columns(model, commands, measured)
-    first, anywhere = _anywhere(calibration, model, parts)
+    first, anywhere = _anywhere(fit, model, parts)
     nominal = next(one.nominal for one in errors if one.of == first.title)
-    findings = findings_of(
-        calibration, used, parts, scatter, mistaken, anywhere, nominal
-    )
+    findings = findings_of(fit, used, parts, scatter, mistaken, anywhere, nominal)
     clean = not (findings.doubtful or (findings.moved and not explains))
     place = None
     if all(part.sensor.views for part in parts):
-        place = place_of(calibration, [f"tool {axis}" for axis in Pose.tool])
+        place = place_of(fit, [f"tool {axis}" for axis in Pose.tool])
     reach = model.length or float(np.ptp(parts[0].points, axis=0).max())
     reasons = findings.reasons
     if place is not None and place.hidden:
@@ -198,11 +194,11 @@ def verdict(model: Chain, calibration: Fit) -> ArmVerdict:
             "value. To find it, turn the tip about another axis, or measure it and "
             "give tool=",
         )
-    if not explains and not calibration.noise_known:
+    if not explains and not fit.noise_known:
         unit_of_first = "" if errors[0].unit == "length" else f" {errors[0].unit}"
-        effects = in_words(calibration, unit_of_first) + play_in_words(calibration)
+        effects = in_words(fit, unit_of_first) + play_in_words(fit)
         reasons += tuple(effects)
-    accuracy = calibration.provenance.get("accuracy")
+    accuracy = fit.provenance.get("accuracy")
     if isinstance(accuracy, float):  # of a file of 0.2
         accuracy = {errors[0].unit: accuracy}
     if accuracy is not None:
@@ -212,7 +208,7 @@ def verdict(model: Chain, calibration: Fit) -> ArmVerdict:
     else:
         good = bool(clean and helps and (explains or ratio + half < _LITTLE))
     more = accuracy is not None or helps is None
-    step = _next_step(findings, scatter, calibration.noise_known, more)
+    step = _next_step(findings, scatter, fit.noise_known, more)
     return ArmVerdict(
         good=good,
         reasons=reasons,
@@ -225,7 +221,7 @@ def verdict(model: Chain, calibration: Fit) -> ArmVerdict:
         anywhere=anywhere,
         accuracy=accuracy,
         place=place,
-        sessions=_sessions(calibration, errors[0]),
+        sessions=_sessions(fit, errors[0]),
         length_unit=model.length_unit(unit),
     )
 
@@ -245,17 +241,17 @@ class Place(NamedTuple):
         return " and ".join(shown) or "nothing"
 
 
-def place_of(calibration: Fit, names: Sequence[str]) -> Place:
+def place_of(fit: Fit, names: Sequence[str]) -> Place:
     """How well six shifts and turns are known.
 
     Hidden are those in directions of which the readings leave half of what is usual of
     a tool: along a SCARA's axes, and all shifts of a gantry.
     """
-    model = calibration.model
+    model = fit.model
     at = np.array([model.names.index(name) for name in names])
     size = np.repeat([0.1 * (model.length or 1.0), 1.7], 3)
-    scaled = np.asarray(calibration.covariance)[np.ix_(at, at)] / np.outer(size, size)
-    lost = np.flatnonzero(calibration.undetermined[at])
+    scaled = np.asarray(fit.covariance)[np.ix_(at, at)] / np.outer(size, size)
+    lost = np.flatnonzero(fit.undetermined[at])
     scaled[lost, lost] += 1.0
     square, axes = np.linalg.eigh(scaled)
     vague = square > _UNSHOWN
@@ -266,16 +262,16 @@ def place_of(calibration: Fit, names: Sequence[str]) -> Place:
     return Place((float(std[0]), float(std[1])), named)
 
 
-def _sessions(calibration: Fit, first: HeldOut) -> str:
+def _sessions(fit: Fit, first: HeldOut) -> str:
     """How sessions differ, in a sentence."""
-    of_sessions = calibration.provenance.get("sessions")
+    of_sessions = fit.provenance.get("sessions")
     if of_sessions is None:
         return (
             "On another day or after remounting the error may be larger; one session "
             "cannot show it (sessions=, --session)."
         )
-    quantity = calibration.model.quantities(calibration.measured_unit)[0]
-    size = first.says(float(quantity.size(calibration.session_std)))
+    quantity = fit.model.quantities(fit.measured_unit)[0]
+    size = first.says(float(quantity.size(fit.session_std)))
     return f"Sessions differ by {size} (1 sigma); predictions include this."
 
 
@@ -319,10 +315,10 @@ def _mean(errors: Array) -> tuple[float, float]:
     return float(errors.mean()), float(half_width)
 
 
-def _nominal(calibration: Fit, used: NDArray[np.intp], parts: list[Part]) -> Array:
+def _nominal(fit: Fit, used: NDArray[np.intp], parts: list[Part]) -> Array:
     """(N, q) errors of the nominal arm, of the rows ``used``."""
-    commands, measured = calibration.commands[used], calibration.measured[used]
-    model, off = calibration.model, np.zeros_like(calibration.residuals)
+    commands, measured = fit.commands[used], fit.measured[used]
+    model, off = fit.model, np.zeros_like(fit.residuals)
     predicted = model.located(commands, measured).predict(commands)
     off[used] = model.wrapped(measured - predicted, commands)
     for part in parts:  # a socket's place is no merit of either
@@ -331,12 +327,10 @@ def _nominal(calibration: Fit, used: NDArray[np.intp], parts: list[Part]) -> Arr
     return off
 
 
-def _in_units(
-    calibration: Fit, part: Part, held_out: Array, off: Array
-) -> Iterator[HeldOut]:
+def _in_units(fit: Fit, part: Part, held_out: Array, off: Array) -> Iterator[HeldOut]:
     """A part's mean errors, those of each unit by themselves."""
-    unit = calibration.measured_unit
-    for quantity in calibration.model.quantities_of(part.sensor, unit):
+    unit = fit.measured_unit
+    for quantity in fit.model.quantities_of(part.sensor, unit):
         of_part, of_nominal = (
             quantity.size(errors[part.rows, : len(part.scale)] * part.scale)
             for errors in (held_out, off)
@@ -347,15 +341,15 @@ def _in_units(
         yield HeldOut(part.title, quantity.unit, mean, interval, nominal)
 
 
-def _scattered(calibration: Fit, usual: Array, parts: list[Part]) -> Reason | None:
+def _scattered(fit: Fit, usual: Array, parts: list[Part]) -> Reason | None:
     """Readings that scatter by more than the noise explains."""
-    if calibration.noise_known:
-        return wrong_noise(calibration)
-    noise, times = np.asarray(calibration.noise_std), scatter(calibration)
+    if fit.noise_known:
+        return wrong_noise(fit)
+    noise, times = np.asarray(fit.noise_std), scatter(fit)
     if times < SCATTER:
         return None
     largest = float(noise[(noise / usual).argmax()])
-    unit = unit_after(calibration) if np.ptp(usual) == 0.0 else ""
+    unit = unit_after(fit) if np.ptp(usual) == 0.0 else ""
     touches = any(isinstance(part.sensor, Socket) for part in parts)
     several = ", or of several sockets numbered as one" * (touches and times > _LOUD)
     return Reason(
@@ -366,7 +360,7 @@ def _scattered(calibration: Fit, usual: Array, parts: list[Part]) -> Reason | No
     )
 
 
-def _anywhere(calibration: Fit, model: Chain, parts: list[Part]) -> tuple[Part, float]:
+def _anywhere(fit: Fit, model: Chain, parts: list[Part]) -> tuple[Part, float]:
     """The first part whose readings are positions, and the standard deviation of the
     tip's position at postures of any kind, beside a shift and a turn of the whole arm.
 
@@ -377,20 +371,20 @@ def _anywhere(calibration: Fit, model: Chain, parts: list[Part]) -> tuple[Part, 
             break
     else:
         return parts[0], np.nan
-    commands = calibration.commands[calibration.loss_weights > 0.0]
+    commands = fit.commands[fit.loss_weights > 0.0]
     joints = commands[:, : model.num_joints]
-    columns = calibration.commands[part.rows[:1], model.num_joints :]
+    columns = fit.commands[part.rows[:1], model.num_joints :]
     turning = np.array(model.command_units) == "deg"
     low, high = np.clip(model.limits, -180.0, 180.0).T
     low = np.where(turning, low, joints.min(axis=0))
     high = np.where(turning, high, joints.max(axis=0))
     drawn = np.random.default_rng(0).uniform(low, high, (_DRAWN, model.num_joints))
-    slopes, covariance = calibration.linear(
+    slopes, covariance = fit.linear(
         np.hstack([drawn, np.repeat(columns, _DRAWN, axis=0)])
     )
     slopes = slopes[:, :3] * part.scale[:3, None]
     slopes[..., part.own] = 0.0
-    null = calibration.unidentified
+    null = fit.unidentified
     if null is not None and depends(slopes, null).any():
         return part, np.nan
     points = model.nominal_tips(drawn)
