@@ -168,14 +168,12 @@ def urdf_text(chains: Sequence[tuple[Arm, Arm]]) -> tuple[str, list[str]]:
             if joint in origins and np.abs(origin - origins[joint]).max() > _AGREE:
                 raise ValueError(f"the chains have joint {joint} in different places")
         origins |= corrected
-        tip = file["tip"]
-        if extra is None:
-            tips.append(tip)
-            continue
-        name = f"{tip}_calibrated"
-        while name in links or f"{name}_joint" in joints:  # a file calibrated before
-            name += "_again"
-        more += fixed_joint(tip, name, extra)
+        name = file["tip"]
+        if extra is not None:
+            name += "_calibrated"
+            while name in links or f"{name}_joint" in joints:  # calibrated before
+                name += "_again"
+            more += fixed_joint(file["tip"], name, extra)
         tips.append(name)
     return with_origins(text, origins, more), tips
 
@@ -197,7 +195,7 @@ def _dh_text(calibrated: Arm) -> str:
     names, others = _moved_by(calibrated)
     if others:
         warnings.warn(
-            f"the table cannot hold coupled joints: {', '.join(others)}", stacklevel=4
+            f"the table cannot hold coupled joints: {', '.join(others)}", stacklevel=3
         )
     table = calibrated.table.copy()
     at = [3 if kind == "R" else 2 for kind in calibrated.joints]  # theta or d
@@ -251,8 +249,7 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
     else:
         frames, before = [], np.eye(4)
         for row in calibrated.table:
-            _, _, d, theta, _ = row
-            frames.append(before @ row_matrix(np.array([0.0, 0.0, d, theta, 0.0])))
+            frames.append(before @ row_matrix(row * [0.0, 0.0, 1.0, 1.0, 0.0]))
             before = row_matrix(row * [1.0, 1.0, 0.0, 0.0, 1.0])
     lines = ["kinematics:"]
     for name, frame, zero in zip(UR, frames, nominal.offset, strict=True):
@@ -279,9 +276,8 @@ def _steps(nominal: Arm, calibrated: Arm) -> tuple[list[list[_Part]], list[Array
     for row, gap in zip(rows[:-1], gaps[1:-1], strict=True):
         turns.append(np.linalg.inv(row) @ turns[-1] @ _product(gap))
     steps = [calibrated.base @ turns[0]]
-    for turn, row, after in zip(turns, new, turns[1:], strict=False):
+    for turn, row, after in zip(turns, new, [*turns[1:], calibrated.tool], strict=True):
         steps.append(np.linalg.inv(turn) @ row @ after)
-    steps.append(np.linalg.inv(turns[-1]) @ new[-1] @ calibrated.tool)
     return gaps, steps
 
 
