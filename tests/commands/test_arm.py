@@ -304,7 +304,7 @@ def test_zeros_are_written_for_lerobot_in_the_shell(files, capsys):
 def test_a_dataset_in_degrees_keeps_its_servos_for_the_file_that_is_written(files):
     options = dict(which=[0, 0, 1], servos="so101.json")
     for in_degrees, read_by in ((False, "so101.json"), (True, None)):
-        arm = mock.create_autospec(SerialChain, instance=True)
+        arm = mock.Mock(spec=SerialChain)
         arm.recorded.return_value = np.zeros((3, 8)), np.zeros((3, 3))
         arm.joint_names, arm.sensor = tuple("abcdefg"), Socket(2)
         given = RecordingOptions(**options, in_degrees=in_degrees)
