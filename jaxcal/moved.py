@@ -27,6 +27,7 @@ MOVED = {  # longer names first
     "jaxcal.models.sensors.position": "jaxcal.arms.sensors.sensor",
     "jaxcal.models.sensors.socket": "jaxcal.arms.sensors.landmarks",
     "jaxcal.models.sensors": "jaxcal.arms.sensors",
+    "jaxcal.models.verdict": "jaxcal.calibration.verdict",
     "jaxcal.models.serial.kernel": "jaxcal.arms.chain_kernel",
     "jaxcal.models.serial.arm_files": "jaxcal.arms.files.write",
     "jaxcal.models.serial.recordings": "jaxcal.arms.files.recordings",

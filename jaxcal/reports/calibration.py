@@ -171,7 +171,7 @@ def _of_predictions(
     return dataclasses.replace(of_rows, names=tuple(names))
 
 
-def _numbers(calibration: Fit, check: Check | None) -> dict[str, Any]:
+def _numbers(calibration: Calibration, check: Check | None) -> dict[str, Any]:
     numbers: dict[str, Any] = {
         "measurements": calibration.num_measurements,
         "parameters": len(calibration.names),
@@ -351,7 +351,7 @@ def _moved_section(
     return pages.Section("What moved", [pages.Table(head, cells), note], "moved")
 
 
-def _residual_sections(calibration: Fit) -> list[pages.Section]:
+def _residual_sections(calibration: Calibration) -> list[pages.Section]:
     names, residuals = calibration.output_names, calibration.residuals
     unit = f" ({calibration.measured_unit})" if calibration.measured_unit else ""
     rows = np.arange(len(residuals), dtype=float)
@@ -369,7 +369,7 @@ def _residual_sections(calibration: Fit) -> list[pages.Section]:
     return sections
 
 
-def _residual_table(calibration: Fit) -> pages.Table:
+def _residual_table(calibration: Calibration) -> pages.Table:
     """A row for each measurement: residuals, weight and, if it has one, leverage."""
     names = calibration.output_names
     head = [*(f"residual {name}" for name in names), "weight"]
@@ -382,7 +382,9 @@ def _residual_table(calibration: Fit) -> pages.Table:
     return _by_row(head, columns)
 
 
-def _before_and_after(calibration: Fit, nominal: Array, unit: str) -> pages.Section:
+def _before_and_after(
+    calibration: Calibration, nominal: Array, unit: str
+) -> pages.Section:
     """The length of each error (N, m), nominal and as fitted, held out if possible."""
     noise_known = calibration.noise_std is not None
     after = left_out(calibration) if noise_known else calibration.residuals

@@ -315,7 +315,7 @@ class World:
         self.jogged[drive] = self.now
 
     def just_jogged(self, drive: FuzzDrive) -> bool:
-        """Whether another moved it since a session can have looked, or slows it down."""
+        """Whether another moved it since a session can have looked."""
         return self.now - self.jogged.get(drive, -1e9) < 0.5
 
     def reconnect(self) -> None:
