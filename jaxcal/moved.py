@@ -11,7 +11,6 @@ MOVED = {  # longer names first
     "jaxcal.evaluation.dataset_files": "jaxcal.evaluation.dataset",
     "jaxcal.evaluation.parameters": "jaxcal.evaluation.postures",
     "jaxcal.evaluation.stream": "jaxcal.evaluation.methods",
-    "jaxcal.evaluation.training_figure": "jaxcal.evaluation.figures",
     "jaxcal.evaluation.results": "jaxcal.evaluation.report",
     "jaxcal.evaluation.sequential": "jaxcal.adaptive.evaluation",
     "jaxcal.learning.environments.brax_env": "jaxcal.learning.brax",

@@ -274,7 +274,8 @@ def _warn_of_radians(arm: Chain, candidates: Array) -> None:
 
 
 def mistaken_columns(arm: Chain, commands: Array, measured: Array) -> str:
-    """Which joints' columns are reversed or exchanged, as a sentence; "" of none.
+    """Which joints' columns are reversed or exchanged, or that the readings are
+    mirrored, as a sentence; "" of none.
 
     Undone on the arm as described, one or two joints reversed or two exchanged, it must
     leave a fifth of the errors, and the least of all of these.
@@ -292,6 +293,13 @@ def mistaken_columns(arm: Chain, commands: Array, measured: Array) -> str:
     best = int((errors > _SAME * errors.min()).argmin()) if len(errors) else -1
     if best < 0 or not errors[best] < _EXPLAINED * _error(arm, commands, measured):
         return ""
+    mirrored = measured[:, [1, 0, 2]] if measured.shape[1] == 3 else measured
+    if measured.any() and _error(arm, commands, mirrored) <= _SAME * errors[best]:
+        return (
+            "the readings seem mirrored: with two columns exchanged, or one of the "
+            "other sign, they agree with the nominal arm; compare their axes with the "
+            "instrument's"
+        )
     joints, word = tried[best]
     names = " and ".join(arm.joint_names[joint] for joint in joints)
     remedy = "exchange" if word == "exchanged" else "negate"

@@ -147,8 +147,8 @@ class Calibration(Fit):
         """
         return self.model.write("urdf", path, self._for_file(), force=force)
 
-    static_transform = late("jaxcal.arms.files.transforms:static_transform")
-    to_transform = late("jaxcal.arms.files.transforms:to_transform")
+    static_transform = late("jaxcal.arms.transforms:static_transform")
+    to_transform = late("jaxcal.arms.transforms:to_transform")
 
     def to_dh(self, path: Path, *, force: bool = False) -> None:
         """Write the DH table as CSV, corrected as ``to_urdf`` says."""

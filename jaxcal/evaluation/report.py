@@ -150,7 +150,7 @@ def write_report(
         blocks += _drawn(draw(evaluation), files, prefix and f"{prefix}_")
         sections.append(Section(shown.heading, blocks))
     if runs:
-        from jaxcal.evaluation.figures import training_curves
+        from jaxcal.evaluation.training_figure import training_curves
 
         curves = {"training_curves": training_curves({run.name: run for run in runs})}
         sections.append(Section("Training", _drawn(curves, files)))

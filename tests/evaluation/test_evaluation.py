@@ -18,7 +18,7 @@ from matplotlib.text import Text
 
 from jaxcal.evaluation import figures
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.figures import evaluation_figures, training_curves
+from jaxcal.evaluation.figures import evaluation_figures
 from jaxcal.evaluation.methods import check_methods, evaluate
 from jaxcal.evaluation.postures import (
     PostureEvaluation,
@@ -31,6 +31,7 @@ from jaxcal.evaluation.report import (
     text_table,
     write_report,
 )
+from jaxcal.evaluation.training_figure import training_curves
 from jaxcal.information.regression import regression_matrix
 from jaxcal.models import Affine
 from jaxcal.paper.datasets import make_dataset

@@ -8,18 +8,20 @@ import json
 import os
 import pathlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.checks import Array, in_words, numbers
 from jaxcal.extras import needs
 from jaxcal.files import write_over
 from jaxcal.models.model import as_parameters
 from jaxcal.models.recording import Recording
+
+if TYPE_CHECKING:
+    from jaxcal.arms.chain import SerialChain as Chain
 
 _WITHIN = 0.05  # degrees in which a resting joint stays
 _JITTER = 8.0  # standard deviations: no reading of a joint at rest is farther apart

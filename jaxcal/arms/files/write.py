@@ -11,7 +11,7 @@ import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.arguments import pose_matrix
 from jaxcal.arms.arm import Arm
-from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.files.urdf import (
     UR,
     Joint,
@@ -38,6 +37,9 @@ from jaxcal.arms.sensors.sensor import BASE
 from jaxcal.checks import Array, one_of
 from jaxcal.files import write_over
 from jaxcal.models.model import as_parameters
+
+if TYPE_CHECKING:
+    from jaxcal.arms.chain import SerialChain as Chain
 
 _TAG = re.compile(rb"""(?:[^>"']+|"[^"]*"|'[^']*')*>""")
 _SAME = 1e-13  # metres and radians: no correction

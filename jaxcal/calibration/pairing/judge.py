@@ -221,10 +221,10 @@ def _found(
     # Loaded, here and below, only where a table is in doubt.
     from jaxcal.calibration.pairing.columns import changed_columns
 
-    fits = _alternatives(table, plain)
+    fits = [fit for fit in _alternatives(table, plain) if not _few(fit)]
     if not any(_explains(plain, fit) for fit in fits):
         fits += changed_columns(table, plain, inputs, outputs)
-    fits = [fit for fit in fits if np.isfinite(fit.evidence) and not _few(fit)]
+    fits = [fit for fit in fits if np.isfinite(fit.evidence)]
     if _lost_its_way(table, plain):
         fits = [fit for fit in fits if fit.hypothesis.kind in _SORTED]
     if not fits:
@@ -242,7 +242,7 @@ def _found(
             if by_itself and not better(benign, best, _BENIGN):
                 return None
     from jaxcal.calibration.pairing.orders import polished
-    from jaxcal.calibration.pairing.verdict import sentence, what_is_wrong
+    from jaxcal.calibration.pairing.words import sentence, what_is_wrong
 
     near: dict[int, list[int]] = {}
     if best.hypothesis.kind == "path":
@@ -352,8 +352,11 @@ def _lost_its_way(table: Table, plain: Fitted) -> bool:
 
 
 def _few(fit: Fitted) -> bool:
-    """Whether a hypothesis is of so few rows from elsewhere that they are outliers."""
+    """Whether a hypothesis is of so few rows from elsewhere that they are outliers, or
+    of so many that few are left."""
     path, count = fit.hypothesis.starts, len(fit.inside)
+    if (fit.hypothesis.match >= 0).sum() < max(LEAST, count // 2):
+        return True
     ends = [start for start, _ in (*path[1:], (count, 0))]
     return bool(path) and any(
         by == FOREIGN and _chance(end - start, end - start, count) > _CHANCE
