@@ -40,7 +40,7 @@ _LOOK = (
 )
 
 _LITTLE = 1.0 / 3.0  # of the nominal error: so little left is worth having anyway
-_LOUD = 10.0  # times the usual noise
+_LOUD, _WILD = 10.0, 100.0  # times the usual noise
 _PLACED = 0.01  # of the arm's length: a camera known to that is found
 _UNSHOWN = 0.5  # of the usual variance: so much is left, readings hardly show it
 _NO_WORSE = 2.0  # times the nominal error: an accurate arm that few readings bend
@@ -206,7 +206,8 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
     elif place is not None and place.std[0] < _PLACED * reach and explains:
         good = clean and ratio < _NO_WORSE
     else:
-        good = bool(clean and helps and (explains or ratio + half < _LITTLE))
+        little = ratio + half < _LITTLE and not _wild(fit)
+        good = bool(clean and helps and (explains or little))
     more = accuracy is not None or helps is None
     step = _next_step(findings, scatter, fit.noise_known, more)
     return ArmVerdict(
@@ -339,6 +340,11 @@ def _in_units(fit: Fit, part: Part, held_out: Array, off: Array) -> Iterator[Hel
         interval = (max(mean - half, 0.0), mean + half)
         nominal = float(of_nominal.mean())
         yield HeldOut(part.title, quantity.unit, mean, interval, nominal)
+
+
+def _wild(fit: Fit) -> bool:
+    """Whether readings scatter so much that no machine does: other units, columns."""
+    return not fit.noise_known and scatter(fit) > _WILD
 
 
 def _scattered(fit: Fit, usual: Array, parts: list[Part]) -> Reason | None:

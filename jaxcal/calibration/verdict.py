@@ -28,6 +28,7 @@ _STEP = 0.1  # standard errors, by which another step would move the parameters
 _BENT, _BENT_MORE = 2.0, 3.0  # times the noise without squares and products of the
 # commands; of a model that is a curve itself
 _SAMPLE, _TERMS = 2000, 600  # readings; twice these terms
+_FROZEN = 3  # readings after the first that repeat it
 _EXACT = 1e-12  # of the largest reading: rounding, and no noise of a sensor
 _UNITS = np.outer([1.0, -1.0], [1.0, np.pi / 180.0, 180.0 / np.pi, 1e3, 1e-3]).ravel()
 _NAMED, _DIGITS = 6, 7  # rows in one sentence; decimals of a table
@@ -124,7 +125,7 @@ class Reason(NamedTuple):
 
 def never_measured(fit: Fit) -> Reason | None:
     """Commands pasted as readings, or readings that never change."""
-    return _equals_command(fit) or _stands_still(fit)
+    return _equals_command(fit) or _stands_still(fit) or froze(fit)
 
 
 def _equals_command(fit: Fit) -> Reason | None:
@@ -164,6 +165,27 @@ def _stands_still(fit: Fit) -> Reason | None:
         f"changes: {_each(readings[0, still][moves])} in all {len(readings)} rows.",
         "check that the sensor is connected, recorded and mounted on the moving part",
     )
+
+
+def froze(fit: Fit) -> Reason | None:
+    """A reading that repeats over rows of other commands, and nowhere else."""
+    moves = (fit.commands[1:] != fit.commands[:-1]).any(axis=1)
+    said = fit.measured - fit.residuals
+    for name, readings, of_fit in zip(
+        fit.output_names, fit.measured.T, said.T, strict=True
+    ):
+        least = _EXACT * np.abs(readings).max()
+        same = np.flatnonzero((np.abs(np.diff(readings)) <= least) & moves)
+        if len(same) < _FROZEN or np.ptp(same) >= len(same) or len(same) == len(moves):
+            continue
+        if np.ptp(of_fit[same]) <= 1e3 * least:
+            continue  # as a machine that gives way there
+        return Reason(
+            f"{name} reads {_short(readings[same[0]])} in every row from {same[0]} to "
+            f"{same[-1] + 1}, and no other repeats: the sensor froze.",
+            "measure these rows (counted from 0) again, or leave them out",
+        )
+    return None
 
 
 def computed(fit: Fit) -> Reason | None:

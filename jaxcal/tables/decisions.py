@@ -19,7 +19,7 @@ COMMANDS, MEASURED = "u_", "y_"  # how the names of columns begin
 _LOG = logging.getLogger("jaxcal")
 AVAILABLE = "available"
 _AVAILABLE = re.compile(
-    r"(is[ _]?)?avail(able|ability)?([ _](rows?|flags?|mask|now))?\W*([\[(].*)?",
+    r"(is[ _]?)?avail(able|ability)?([ _](rows?|flags?|mask|now))?[\W_]*([\[(].*)?",
     re.IGNORECASE,
 )
 _LEAST_ROWS = 5  # of which a constant step is no chance
@@ -38,6 +38,7 @@ _STAMPS = {"stamp", "timestamp", "date", "datetime", "epoch", "datum"}
 _TIMES = {"time", "uhrzeit", "elapsed", "clock"}
 # T alone is a temperature.
 _SECONDS = re.compile(r"t|[tT][ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?")
+_MARKS = "holds 0 and 1; if it says which rows may be chosen, name it available"
 COUNTED = "it looks like a row number or a time"
 _LIKE_U, _LIKE_Y = re.compile(r"[uU]\d*|U_.*"), re.compile(r"[yY]\d*|Y_.*")
 _PLURALS = {  # of a reason's begin
@@ -120,6 +121,8 @@ def _of_numbers(
         return Decision("left out", COUNTED)
     if marked:
         return Decision("left out", f"commands begin with {COMMANDS}")
+    if _RUNS.fullmatch(plain):
+        return Decision("input", "holds a number twice or more")
     if _LIKE_Y.fullmatch(name) and any(_LIKE_U.fullmatch(x) for x in header):
         return Decision("input", f"readings begin with {MEASURED}")
     return Decision("input")
@@ -166,17 +169,25 @@ def _of_time(name: str, numbers: Array) -> Decision | None:
 
 
 def _counting(table: Any, decisions: dict[str, Decision]) -> dict[str, Decision]:
-    """Inputs that by their values count the rows, beside inputs that do not."""
+    """Inputs that by their values count or mark the rows, beside others that do not."""
     names = [name for name, decision in decisions.items() if decision.role == "input"]
     columns = [table.values[:, table.names.index(name)] for name in names]
     reasons = [_count(column) for column in columns]
     if None not in reasons:
         return {}  # all are swept together: a table of one axis, say
-    return {
+    counting = {
         name: Decision("left out", reason, asks=True)
         for name, reason in zip(names, reasons, strict=True)
         if reason is not None and not decisions[name].reason
     }
+    marks = [{*np.unique(column)} == {0.0, 1.0} for column in columns]
+    if False in marks:
+        counting |= {
+            name: Decision("input", _MARKS)
+            for name, mark in zip(names, marks, strict=True)
+            if mark and not decisions[name].reason
+        }
+    return counting
 
 
 def _count(column: Array) -> str | None:

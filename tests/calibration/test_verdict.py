@@ -576,3 +576,15 @@ def test_a_straight_line_through_a_curve_is_told(rng):
         u = rng.uniform(-20.0, 20.0, (int(rng.integers(8, 60)), n))
         y = u @ rng.normal(size=(n, m)) + 0.05 * rng.standard_t(5, (len(u), m))
         assert "curve" not in str(jaxcal.identify(u, y).verdict), count
+
+
+@pytest.mark.parametrize("outputs", [[0], [0, 1]])
+def test_a_sensor_that_froze_is_told(outputs):
+    rng = np.random.default_rng(1)
+    u = rng.uniform(-5.0, 5.0, (20, 2))
+    y = u @ [[1.1, 0.3], [-0.2, 0.9]] + 0.05 * rng.normal(size=(20, 2))
+    y[12:, outputs] = y[11, outputs]
+    with pytest.warns(jaxcal.CalibrationWarning, match="froze"):
+        verdict = jaxcal.identify(u, y).verdict
+    assert not verdict.good
+    assert "in every row from 11 to 19" in verdict.reasons[0]

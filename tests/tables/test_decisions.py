@@ -57,6 +57,30 @@ def test_readings_are_named_where_y_is_an_axis():
 
 
 @pytest.mark.parametrize(
+    ("name", "column", "words"),
+    [
+        ("usable", np.tile([0.0, 1.0], 6), "name it available"),
+        ("run", np.tile([1.0, 2.0], 6), "holds a number twice or more"),
+    ],
+)
+def test_what_could_be_meant_otherwise_is_said(name, column, words):
+    table = roles(f"{name},a,b", {name: column})[0]
+    with pytest.warns(UserWarning, match=f"'{name}' is read as input: .*{words}"):
+        assert table.commands(None) == (name, "a", "b")
+
+
+def test_a_design_of_two_levels_is_read_without_a_word():
+    levels = np.array([[i >> k & 1 for k in range(3)] for i in range(8)], float)
+    names = parse(
+        "t.csv",
+        (
+            "a,b,c\n" + "\n".join(",".join(map(str, row)) for row in levels.tolist())
+        ).encode(),
+    ).commands(None)
+    assert names == ("a", "b", "c")
+
+
+@pytest.mark.parametrize(
     ("header", "column", "role"),
     [
         ("time,a,b", SORTED, "time"),

@@ -165,6 +165,7 @@ def test_true_and_false_are_numbers_where_a_command_is_asked_for():
         "AVAILABLE",
         " available ",
         "available?",
+        "available_",
         "Available (0/1)",
     ],
 )

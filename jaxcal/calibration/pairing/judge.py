@@ -26,6 +26,7 @@ from jaxcal.calibration.pairing.table import (
     as_it_is,
     path_match,
 )
+from jaxcal.calibration.verdict import froze
 from jaxcal.checks import Array
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Prior
@@ -90,7 +91,7 @@ class Mispairing:
 
 def mispairing(fit: Fit) -> Mispairing | None:
     """How the measurements of a calibration were mispaired; None: they were not."""
-    if len(fit.commands) < LEAST:
+    if len(fit.commands) < LEAST or froze(fit):
         return None
     if not fit.model.linear and fit.model.default_noise() is None:
         if other := _taken_up(fit):

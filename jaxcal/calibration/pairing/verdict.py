@@ -10,7 +10,7 @@ import numpy as np
 from jaxcal.calibration.pairing.fit import fitted, predicted
 from jaxcal.calibration.pairing.judge import LEAST, RATIO, benign_fits, better, of_fit
 from jaxcal.calibration.pairing.table import as_it_is
-from jaxcal.calibration.verdict import Reason, Verdict, bends, in_rows
+from jaxcal.calibration.verdict import Reason, Verdict, bends, froze, in_rows
 from jaxcal.checks import in_words
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ def against(verdict: Verdict, fit: Calibration) -> Verdict:
     """The verdict of the fit by itself, which no calibration passes of a mispaired
     table, outliers that hide in its noise, or a curve."""
     pairing = fit.mispairing
+    if pairing is None and froze(fit):
+        return verdict
     if pairing is None:
         follow = ("outlier", "The noise you gave")  # from these rows, or the curve
         others = tuple(
