@@ -5,6 +5,11 @@ import sys
 from importlib.machinery import ModuleSpec
 
 MOVED = {  # longer names first
+    "jaxcal.adaptive.journal": "jaxcal.adaptive.loop",
+    "jaxcal.adaptive.policy.features": "jaxcal.adaptive.policy.network",
+    "jaxcal.adaptive.policy.sessions": "jaxcal.adaptive.policy.network",
+    "jaxcal.plots.curves": "jaxcal.reports.plots.drawings",
+    "jaxcal.plots.scatter": "jaxcal.reports.plots.drawings",
     "jaxcal.calibration.budget": "jaxcal.reports.budget",
     "jaxcal.calibration.report": "jaxcal.reports.calibration",
     "jaxcal.csvtable": "jaxcal.tables",

@@ -109,7 +109,6 @@ class Rule(abc.ABC):
         changed |= {n: getattr(self, n) + by[i] for n, i in self.exponents.items()}
         return dataclasses.replace(self, **changed)  # type: ignore[type-var]  # flax
 
-    @abc.abstractmethod
     def price(
         self, task: Any, session: Session, options: Options, *expected: jax.Array
     ) -> jax.Array:
@@ -117,6 +116,7 @@ class Rule(abc.ABC):
 
         ``expected``: their gains, seconds and uses, (A,) each.
         """
+        raise NotImplementedError("a Rule defines price, or judged")
 
     def judged(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array

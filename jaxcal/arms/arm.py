@@ -309,7 +309,7 @@ class Arm:
         if not any(one.zeros and one.lengths for one in self.sensor.members):
             return False
         slides = np.flatnonzero(self.drive[~self._revolute].any(axis=0))
-        ways = np.ptp(commands[:, slides], axis=0)
+        ways = np.ptp(commands[:, slides], axis=0) if slides.size else np.zeros(0)
         return bool((ways < _STILL * self.length).all())
 
     @functools.cached_property

@@ -161,7 +161,11 @@ class SerialChain(Arm, Model):
         if bending and not len(loads):
             loads = _usual_loads(n, end)
         per_torque = np.zeros(len(bending)) if yields is None else yields
-        swings = np.zeros((len(bent), 4)) if waves is None else waves
+        swings = np.zeros((len(bent), 4)) if waves is None else numbers("waves", waves)
+        if swings.size != 4 * len(bent):
+            raise ValueError(
+                f"waves must have shape ({len(bent)}, 4), got {swings.shape}"
+            )
         return cls(
             rows,
             one_of("convention", convention, ("standard", "modified")),
@@ -173,7 +177,7 @@ class SerialChain(Arm, Model):
             bending,
             array_of("yields", per_torque, len(bending)),
             bent,
-            np.zeros((0, 4)) if not bent else array_of("waves", swings, len(bent), 4),
+            array_of("waves", swings.reshape(-1, 4), len(bent), 4),
             tuple(load(one, n) for one in loads),
             tuple(array_of("gravity", gravity, 3).tolist()),
             axis_names("joint_names", joint_names or _numbered(columns), "", columns),
@@ -366,10 +370,10 @@ class SerialChain(Arm, Model):
                 f"measured), got {len(tables)} pairs"
             )
         named = []
-        for i, (one, table) in enumerate(zip(sensors, tables, strict=True)):
+        for i, (one, (given, read)) in enumerate(zip(sensors, tables, strict=True)):
             at = [j + self.sensor.inputs.index(name) for name in one.inputs]
             noise = one.stds(self.length)
-            named.append(OneTable(one.kind, i, [*range(j), *at], noise, *table))
+            named.append(OneTable(one.kind, i, [*range(j), *at], noise, given, read))
         return stacked(named, j, self.num_inputs, self.num_outputs)
 
     def located(self, commands: ArrayLike, measured: ArrayLike | None = None) -> Self:

@@ -399,9 +399,11 @@ class Chains(Model):
                 what it measured, or None for zeros (contacts) and candidates.
         """
         named = []
-        for tip, table in tables.items():
+        for tip, (given, read) in tables.items():
             k = self.tips.index(one_of("tip", tip, self.tips))
-            named.append(OneTable(tip, k, self._columns[k], self._scale(k), *table))
+            named.append(
+                OneTable(tip, k, self._columns[k], self._scale(k), given, read)
+            )
         label, q = len(self.joint_names), self.num_outputs
         return stacked(named, label, self.num_inputs, q)
 

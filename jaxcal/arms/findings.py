@@ -450,7 +450,7 @@ def _swapped(fit: Fit, part: Part, explains: bool) -> dict[int, int]:
         column = model.num_joints + model.sensor.inputs.index(sensor.inputs[0])
         stated = trial[..., column].copy()
         trial[..., column] = np.arange(sensor.num_places)[:, None]
-        off = np.abs(fit.predict(trial) / noise).max(axis=-1)
+        off = np.abs(fit.outputs_at(trial) / noise).max(axis=-1)
         for other, row in np.argwhere((off < 4.0) & (stated != trial[..., column])):
             swaps[int(at[row])] = int(other)
     if isinstance(sensor, Socket) and not explains:

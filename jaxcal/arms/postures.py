@@ -79,8 +79,7 @@ def _room_of(
     """Checked; the cone of an approach without its angle is 60 degrees."""
     if radius is not None and not len(clear):
         raise ValueError(f"radius needs clear= (planes or boxes), got {radius}")
-    if floor is not None:
-        numbers("floor", floor)
+    floor = None if floor is None else float(numbers("floor", floor))
     if radius is not None and not numbers("radius", radius) > 0.0:
         raise ValueError(f"radius must be positive, got {radius}")
     if floor is None and approach is None and not len(clear):

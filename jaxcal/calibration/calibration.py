@@ -234,7 +234,7 @@ class Calibration(Fit):
             change = "it was fitted without harmonics"
             again = self.again(plain, plain.default_prior())
             parameters = again.parameters
-            off = again.predict(self.commands) - self.predict(self.commands)
+            off = again.outputs_at(self.commands) - self.outputs_at(self.commands)
             if again.noise_std is not None and self.noise_std is not None:
                 verdicts: tuple[Any, Any] = again.verdict, self.verdict
                 errors = (

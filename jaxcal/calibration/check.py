@@ -210,7 +210,7 @@ def _deviations(
 ) -> _Deviations:
     """The deviations of measurements, of which ``check`` has the arguments."""
     noise = calibration.require_noise("check")
-    predicted = calibration.predict(commands)
+    predicted = calibration.outputs_at(commands)
     off = calibration.model.wrapped(measured - predicted, commands)
     _require_unit(calibration, predicted + off, predicted, noise)
     slopes = np.asarray(calibration.model.jacobian(commands, calibration.parameters))

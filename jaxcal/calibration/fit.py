@@ -220,13 +220,23 @@ class Fit:
     # -- prediction --------------------------------------------------------------------
 
     def predict(self, commands: ArrayLike) -> Array:
-        """Outputs (..., m) at commands (..., n)."""
+        """Outputs (..., m) at commands (..., n); a warning tells of far ones."""
+        self._say_far(commands)
+        return self.outputs_at(commands)
+
+    def outputs_at(self, commands: ArrayLike) -> Array:
+        """``predict`` without a warning."""
+        points = self.points("commands", commands, self.num_inputs)
+        outputs = predict(
+            self.whole, points.reshape(-1, self.num_inputs), self.estimate
+        )
+        return outputs.reshape(*points.shape[:-1], self.num_outputs)
+
+    def _say_far(self, commands: ArrayLike) -> None:
         points = self.points("commands", commands, self.num_inputs)
         rows = points.reshape(-1, self.num_inputs)
         sides = [(self.input_names, rows, self.commands)]
-        say_far("command", self.loss_weights > 0.0, sides)
-        outputs = predict(self.whole, rows, self.estimate)
-        return outputs.reshape(*points.shape[:-1], self.num_outputs)
+        say_far("command", self.loss_weights > 0.0, sides, stacklevel=4)
 
     def predict_std(
         self, commands: ArrayLike, *, new_measurement: bool = False

@@ -18,6 +18,7 @@ from jaxcal.late import late
 
 if TYPE_CHECKING:
     from jaxcal.calibration.calibration import Calibration as Fit
+    from jaxcal.calibration.fit import Fit as Fitted
 
 UNLIKELY = 1e-4  # p-value of residuals under the noise that was given
 _CHANCE = 0.01  # that readings of nothing pass for a fit
@@ -103,7 +104,7 @@ def between_sessions(fit: Fit, labels: NDArray[np.intp]) -> Array:
         if trial.noise_std is not None and rows.any():
             commands = fit.commands[rows]
             off = fit.model.wrapped(
-                fit.measured[rows] - trial.predict(commands), commands
+                fit.measured[rows] - trial.outputs_at(commands), commands
             )
             square.append(off**2)
             expected.append(trial.predict_std(commands, new_measurement=True) ** 2)
@@ -167,7 +168,7 @@ def _stands_still(fit: Fit) -> Reason | None:
     )
 
 
-def froze(fit: Fit) -> Reason | None:
+def froze(fit: Fitted) -> Reason | None:
     """A reading that repeats over rows of other commands, and nowhere else."""
     moves = (fit.commands[1:] != fit.commands[:-1]).any(axis=1)
     said = fit.measured - fit.residuals

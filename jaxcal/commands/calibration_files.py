@@ -127,7 +127,8 @@ class SavedFiles:
         for option in ("unproven", "overwrite"):
             of_table = self.repair and option == "overwrite"
             if getattr(self, option) and not (self.corrected or of_table):
-                raise ValueError(f"--{option} needs {files}")
+                more = " or --repair" * (option == "overwrite")
+                raise ValueError(f"--{option} needs {files}{more}")
         if self.frames is not None and not self.transform:
             raise ValueError("--frames needs --transform FILE")
         if len((self.frames or "a,b").split(",")) != 2:

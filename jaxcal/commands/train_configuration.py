@@ -220,7 +220,7 @@ def fixed_validation(config: TrainConfig) -> Validation:
 def teacher(
     candidates: np.ndarray, available: np.ndarray, given: np.ndarray, k: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The best postures of every set, as ``imitation.Teacher`` wants them.
+    """The best postures of every set, as ``postures.Teacher`` wants them.
 
     The proven optimum where k is the number of regressors. Above it, what Fedorov
     exchange finds from its default restarts: almost always optimal, and in a time that

@@ -212,7 +212,11 @@ def _rows(shown: Summary) -> list[tuple[str, ...]]:
 
 def _checkpoints(shown: Summary) -> list[Any]:
     """The checkpoints of the policies, without repeats."""
-    return [*dict.fromkeys(row.checkpoint for row in shown.rows if row.is_policy)]
+    checkpoints: list[Any] = []  # of tasks they are dictionaries, without a hash
+    for row in shown.rows:
+        if row.is_policy and row.checkpoint not in checkpoints:
+            checkpoints.append(row.checkpoint)
+    return checkpoints
 
 
 def _entries(shown: Summary) -> list[dict[str, Any]]:

@@ -86,6 +86,10 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'jaxcal.learning' has no attribute {name!r}")
 
 
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
 def make_train(config: Any) -> Any:
     """A whole training as one pure function, to be jitted, scanned or vmapped.
 

@@ -155,7 +155,7 @@ class JaxVector(VectorEnv):
 
 def _postures(sizes: dict[str, Any]) -> PosturesEnv:
     fields = [field.name for field in dataclasses.fields(SelectionConfig)]
-    for name in set(sizes).difference(fields):
+    for name in [name for name in sizes if name not in fields]:
         raise ValueError(f"options must be of {', '.join(fields)}, got {name}")
     return PosturesEnv(SelectionConfig(**sizes))
 

@@ -198,7 +198,10 @@ class Runs:
             alone = [(j, i) for j, rows in broken for i in range(rows.start, rows.stop)]
             for j, i in alone:
                 self.close()
-                answer = _result(self._submit(jobs[j][0][[i]], jobs[j][1]))
+                try:
+                    answer = _result(self._submit(jobs[j][0][[i]], jobs[j][1]))
+                except concurrent.futures.BrokenExecutor:  # a caller's own
+                    answer = None
                 self.close()
                 ended = np.zeros((0, 0)), {0: "its process ended"}
                 yield (j, slice(i, i + 1)), answer or ended

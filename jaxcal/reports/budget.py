@@ -257,7 +257,7 @@ def _results(calibration: Fit, commands: ArrayLike | None) -> _Results:
     outputs = calibration.output_names
     return _Results(
         tuple(f"{output} at row {i}" for i in range(len(points)) for output in outputs),
-        calibration.predict(points).ravel(),
+        calibration.outputs_at(points).ravel(),
         calibration.measured_unit,
         slopes.reshape(-1, slopes.shape[-1]),
     )

@@ -306,7 +306,7 @@ def _text(value: Any) -> str:
 def _new_section(
     calibration: Fit, commands: ArrayLike, measured: ArrayLike
 ) -> pages.Section:
-    off = np.asarray(measured, float) - calibration.predict(commands)
+    off = np.asarray(measured, float) - calibration.outputs_at(commands)
     off = calibration.model.wrapped(off, np.asarray(commands, float))
     std = calibration.predict_std(commands, new_measurement=True)
     kinds = ("off", "off in standard deviations")

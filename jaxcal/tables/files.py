@@ -260,9 +260,14 @@ def _cells(lines: Sequence[str], delimiter: str) -> list[tuple[int, list[str]]]:
             line = reader.line_num + 1
     except csv.Error as error:
         raise ValueError(f"line {reader.line_num}: {error}") from None
-    quoted = rows and any("\n" in cell for cell in rows[-1][1])
-    if quoted and "".join(lines).count('"') % 2:
-        raise ValueError(f'line {begun}: a quote (") is never closed')
+    if rows and any("\n" in cell for cell in rows[-1][1]):
+        texts = (f"{text}\n" for text in lines)
+        try:  # a quote within a cell is none: only the strict reader knows
+            for _ in csv.reader(texts, delimiter=delimiter, strict=True):
+                pass
+        except csv.Error as error:
+            if "end of data" in str(error):
+                raise ValueError(f'line {begun}: a quote (") is never closed') from None
     return [(line, [_BREAK.sub(" ", cell) for cell in cells]) for line, cells in rows]
 
 

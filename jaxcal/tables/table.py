@@ -245,14 +245,16 @@ class Table:
             return None
         cells = self.labels.get(names[0])
         if cells is None:
-            cells = numbers = self.values[:, self.names.index(names[0])].tolist()
+            numbers = self.values[:, self.names.index(names[0])].tolist()
+            cells = [f"{x:g}" if x == x else "" for x in numbers]
         else:
             numbers = [(truths_of([cell]) or [np.nan])[0] for cell in cells]
         for line, cell, number in zip(self.lines, cells, numbers, strict=True):
             if number not in (0.0, 1.0):
                 raise ValueError(
                     f"{self.source}: {self.row} {line}, {names[0]} must be 1 or 0, "
-                    f"TRUE or FALSE, or yes or no, got {cell!r}"
+                    f"TRUE or FALSE, or yes or no, got "
+                    + (repr(cell) if cell else "an empty cell")
                 )
         return np.array(numbers) == 1.0
 
@@ -270,10 +272,11 @@ class Table:
     def _chosen(self, chosen: str, prefix: str, unit: str = "") -> tuple[str, ...]:
         """The columns of the names given, which must be there, each once."""
         given = split(chosen)
-        columns = columns_by_name(given, self.header, prefix, unit)
-        for name, column in zip(given, columns, strict=True):
+        for name in given:
             if given.count(name) > 1:
                 raise ValueError(f"{self.source}: column {name!r} is named twice")
+        columns = columns_by_name(given, self.header, prefix, unit)
+        for name, column in zip(given, columns, strict=True):
             if column is None:
                 self.columns([name])  # says that there is none
         return tuple(columns)
@@ -361,6 +364,6 @@ def _require_numbers(
         if number is None:
             raise ValueError(
                 f"{table.source}: {table.row} {line}, column {name!r} must hold a "
-                f"number, got {cell!r}"
+                f"number, got {cell!r}; correct it, or leave the row or column out"
             )
     raise AssertionError(name)

@@ -204,7 +204,7 @@ class Device:
                 drive.mirror_limits()
         self.imu.latest()
         self.line_watch.apply()
-        self.rest = tuple(d.last.position for d in self.drives if d.last)
+        self.rest = self.positions()  # nothing is to move it before the first move
         self.armed = True
         self.heartbeat.start()
 

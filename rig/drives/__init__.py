@@ -74,8 +74,10 @@ def make_drives(
 ) -> tuple[Line, list[Drive]]:
     """The line of a device, to be opened, and the drive of each axis on it; Refused
     where they are of several kinds of line, or of none on this bus."""
-    maps = {axis.map.drive: axis.map for axis in axes}
-    kinds = {name: kind_of(drive_map) for name, drive_map in maps.items()}
+    kinds: dict[str, type[Drive]] = {}
+    for axis in axes:
+        if axis.map.drive not in kinds:
+            kinds[axis.map.drive] = kind_of(axis.map)
     lines = {kind.line_type for kind in kinds.values()}
     if len(lines) > 1:
         raise Refused(f"the drives of a device must be of one kind: {', '.join(kinds)}")

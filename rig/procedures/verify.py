@@ -178,12 +178,13 @@ def _command(config: RigConfig, calibration: Any, desired: Array) -> Array:
     if config.model is not None:
         limits = [(axis.min_deg, axis.max_deg) for axis in config.axes]
         try:
-            return np.asarray(calibration.command_for(desired, limits=limits))
+            commands = calibration.command_for(desired, limits=limits)
+            return np.asarray(commands, dtype=np.float64)
         except ValueError as error:
             text = f"goto: no command gives {desired.tolist()}: {error}"
             raise Refused(text) from None
     if len(desired) > len(config.axes):  # as near as they can
-        at_zero, *others = calibration.predict(np.eye(len(config.axes) + 1)[:, 1:])
+        at_zero, *others = calibration.outputs_at(np.eye(len(config.axes) + 1)[:, 1:])
         matrix = np.transpose(others) - at_zero[:, None]
         return np.asarray(np.linalg.lstsq(matrix, desired - at_zero)[0])
     return np.asarray(calibration.command_for(desired), dtype=np.float64)

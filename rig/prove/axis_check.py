@@ -227,12 +227,12 @@ def find(
     size = np.linalg.norm(rates, axis=0)
     axes = rates / size
     told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
-    named = np.eye(3)[:, [LETTERS.index(letter) for letter in config.letters]]
-    joints, signs, mounting = _placed(
-        config, axes, named if expected is None else expected
-    )
+    of_arm = expected is not None  # whose joints have no letters
+    if expected is None:
+        expected = np.eye(3)[:, [LETTERS.index(letter) for letter in config.letters]]
+    joints, signs, mounting = _placed(config, axes, expected)
     turned, order = float(np.linalg.norm(turn(told, mounting))), None
-    if expected is not None:  # the order of an arm's joints is known
+    if of_arm:  # the order of its joints is known
         return Findings(joints, signs * size, mounting, turned, order)
     inner = _inner(config, stands, rates)
     if inner is not None:
@@ -245,7 +245,7 @@ def find(
         order = "".join(config.letters[joints[i]] for i in np.argsort(inner)[::-1])
     as_told = axes * [axis.direction for axis in config.axes]
     # Of fewer axes nothing is a mirror.
-    mirrored = rates.shape[1] == 3 and np.linalg.det(as_told @ named) < 0
+    mirrored = rates.shape[1] == 3 and np.linalg.det(as_told @ expected) < 0
     if mirrored and order is None:
         raise MotionFault(
             "the axes are mirrored, and the phone is too noisy to show whether a "

@@ -167,7 +167,7 @@ def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
             drive.status()
             fault = drive.foreign(values)
         except BusError as error:
-            fault, verb = str(error), "does not answer like"
+            fault, verb = str(error) or repr(error), "does not answer like"
         if fault:
             raise Refused(
                 f"{axis.name} (unit {axis.unit}) {verb} {axis.map.name}: {fault}. Run "

@@ -455,3 +455,17 @@ def test_a_function_that_underflows_has_no_effect(loss):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         assert not jaxcal.identify(x, y, model=model, loss=loss).verdict.good
+
+
+def test_a_start_is_no_nominal_machine():
+    """A prior that says nothing but where to begin: no sign is told by it."""
+
+    def wave(u, theta):
+        return (theta[0] * np.sin(theta[1] * u[:, 0]))[:, None]
+
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1.5, 1.5, (30, 1))
+    y = wave(u, [-1.2, 1.1]) + 0.01 * rng.normal(size=(30, 1))
+    model = FromFunction(wave, [5.0, 5.0], batch=True, quiet=True)
+    start = jaxcal.Prior(np.inf, mean=[1.0, 1.0])
+    assert jaxcal.identify(u, y, model=model, prior=start).verdict.good

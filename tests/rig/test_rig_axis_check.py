@@ -1,14 +1,17 @@
 """What small moves say, against a chain of joints built by products of rotations."""
 
+from unittest import mock
+
 import numpy as np
 import pytest
-from harness import changed, fast_config
+from harness import arm_text, changed, fast_config
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rig.config import AXIS_NAMES
+from rig.config import AXIS_NAMES, parse_config
 from rig.faults import MotionFault
+from rig.prove import axis_check
 from rig.prove.axis_check import (
     Stand,
     corner_name,
@@ -109,6 +112,17 @@ def test_units_signs_gains_order_and_placement_are_found(
     np.testing.assert_allclose(found.deg_per_pulse, rates, rtol=2e-3)
     assert found.order == order
     assert angle_between_deg(found.mounting, mounting) < 0.3
+
+
+def test_joints_of_an_arm_have_no_letters_and_are_found_by_its_axes():
+    config = parse_config(arm_text())
+    expected = np.random.default_rng(3).normal(size=(3, 5))
+    expected /= np.linalg.norm(expected, axis=0)
+    rates = expected * [0.01, -0.02, 0.01, 0.03, 0.01]
+    with mock.patch.object(axis_check, "rates_of", return_value=rates):
+        found = find(config, {}, expected)
+    assert found.joints == (0, 1, 2, 3, 4) and found.order is None
+    np.testing.assert_allclose(found.deg_per_pulse, [0.01, -0.02, 0.01, 0.03, 0.01])
 
 
 def test_a_device_as_configured_needs_no_correction():

@@ -62,7 +62,7 @@ def changed_columns(
 
 def by_nominal(
     table: Table, inputs: Sequence[str], outputs: Sequence[str]
-) -> ColumnChange | None:
+) -> Fitted | None:
     """A change by which the prior's mean explains readings that it does not without.
 
     A nonlinear fit may take up a unit or a sign in a parameter and leave nothing over.
@@ -82,8 +82,9 @@ def by_nominal(
         return None
     nominal = dataclasses.replace(table, theta=table.mean)
     for fit in fits_of(nominal, [kinds[best]]):  # whose parameters are near it
-        if (np.abs(fit.theta - table.mean) <= np.abs(table.mean)).all():
-            return kinds[best].change
+        near = np.abs(fit.theta - table.mean) <= np.abs(table.mean)
+        if near[table.mean != 0.0].all():
+            return fit
     return None
 
 
@@ -98,6 +99,7 @@ def _unexplained(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
     with np.errstate(all="ignore"):
         ratio = (readings * outputs).sum(axis=0) / (outputs**2).sum(axis=0)
         off = readings - outputs * np.clip(ratio, 1.0 / _FACTOR, _FACTOR)
+        off = table.model.wrapped(off, commands)
         share = (off**2).sum(axis=0) / (readings.var(axis=0) * len(rows))
     return np.nan_to_num(share, nan=np.inf, posinf=np.inf)
 

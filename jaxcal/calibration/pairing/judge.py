@@ -93,31 +93,28 @@ def mispairing(fit: Fit) -> Mispairing | None:
     """How the measurements of a calibration were mispaired; None: they were not."""
     if len(fit.commands) < LEAST or froze(fit):
         return None
-    if not fit.model.linear and fit.model.default_noise() is None:
-        if other := _taken_up(fit):
-            return other
-    if _plainly_right(fit):
-        return None
-    if fit.noise_known:
-        lack = fit.lack_of_fit()
-        if lack is None or lack > 1e-3:
-            return None
-    return _found(of_fit(fit), fit.input_names, fit.output_names, fit.measured_unit)
+    lack, seen = fit.lack_of_fit() if fit.noise_known else 0.0, None
+    if lack is not None and lack <= 1e-3 and not _plainly_right(fit):
+        seen = _found(of_fit(fit), fit.input_names, fit.output_names, fit.measured_unit)
+    if seen is None and not fit.model.linear and fit.model.default_noise() is None:
+        return _taken_up(fit)
+    return seen
 
 
 def _taken_up(fit: Fit) -> Mispairing | None:
     """A unit, a sign or a place that a nonlinear fit took up in its parameters."""
+    if fit.stated_prior is not None and not fit.prior_precision.any():
+        return None  # its mean is where a search starts, no machine
     from jaxcal.calibration.pairing.columns import by_nominal
 
     table = of_fit(fit)
-    change = table and by_nominal(table, fit.input_names, fit.output_names)
-    if not change or fit.noise_std is None:
+    nominal = table and by_nominal(table, fit.input_names, fit.output_names)
+    if not (table and nominal):
         return None
-    noise = fit.noise_std
-    if change.of_readings:
-        noise = noise * np.abs(change.factors)
-    match = np.arange(len(fit.commands))
+    change, match = nominal.hypothesis.change, np.arange(len(fit.commands))
+    assert change is not None
     reason = f"{change.words}, for the nominal parameters explain it then and not now"
+    noise = nominal.noise * table.scale
     return Mispairing("columns", reason, noise, match, change, fit.model.sensed)
 
 
@@ -157,7 +154,7 @@ def of_new_readings(fit: Fit, commands: Array, measured: Array) -> Mispairing | 
 def of_fit(fit: Fit) -> Table | None:
     """The table of a fit, linearised there."""
     prior = fit.stated_prior or fit.model.default_prior()
-    measured = fit.residuals + fit.predict(fit.commands)
+    measured = fit.residuals + fit.outputs_at(fit.commands)
     counted = fit.loss_weights > 0.0
     table = _table(fit.model, fit.commands, measured, counted, prior)
     if table is None:
@@ -305,7 +302,7 @@ def _plainly_right(fit: Fit) -> bool:
     off, used = fit.residuals, fit.loss_weights > 0.0
     if not used.all():
         return False
-    said = fit.predict(fit.commands)
+    said = fit.outputs_at(fit.commands)
     rms = np.sqrt((off**2).mean(axis=0))
     apart = np.sort(np.abs(said[1:] - said[:-1]), axis=0)[len(off) // 2 - 1]
     if (rms <= _EXACT * apart).all():

@@ -63,7 +63,7 @@ class Network(nn.Module):
 
     def lookahead_logits(self, decision: Any) -> Scores:
         """Logits as of ``decode``, for one of the last ``num_unlearned`` choices."""
-        raise NotImplementedError
+        raise NotImplementedError("a Network with num_unlearned > 0 defines this")
 
     def __call__(
         self, candidates: jax.Array, available: jax.Array, chosen: jax.Array

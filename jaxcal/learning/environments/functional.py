@@ -129,7 +129,12 @@ class FunctionalEnv(abc.ABC):
         state = self.begin(key)
         return self.observation(state), state
 
-    reset = functools.partial(jax.jit, static_argnames="self")(reset_env)
+    @functools.partial(jax.jit, static_argnames="self")
+    def reset(
+        self, key: jax.Array, params: EnvParams | None = None
+    ) -> tuple[jax.Array, Any]:
+        """Observation and state of a new episode."""
+        return self.reset_env(key, params)
 
     @functools.partial(jax.jit, static_argnames="self")
     def step(

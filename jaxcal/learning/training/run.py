@@ -248,6 +248,7 @@ def run(
             fit = int(_CALL_SECONDS / seconds) if timed else 1
             count, timed = devices.on_first(functools.partial(max, fit, 1)), True
         if recorder is not None:
+            recorder.close()  # rows before the checkpoint that counts them
             recorder.save(state, done)
     if broken:
         raise DivergedError(broken)
@@ -441,5 +442,6 @@ class _Table:
         self._file.flush()
 
     def close(self) -> None:
-        os.fsync(self._file.fileno())
-        self._file.close()
+        if not self._file.closed:
+            os.fsync(self._file.fileno())
+            self._file.close()
