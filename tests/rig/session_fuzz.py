@@ -18,6 +18,7 @@ import errno
 import functools
 import heapq
 import itertools
+import math
 import os
 import pathlib
 import random
@@ -311,6 +312,10 @@ class World:
         angle = min(max(angle, axis.min_deg), axis.max_deg)
         target = round(angle * drive.pulses_per_deg) + drive.offset
         speed = 20.0 * abs(drive.pulses_per_deg)
+        stops = drive.velocity**2 / (20.0 * speed)
+        ahead = (drive.position + math.copysign(stops, drive.velocity)) - drive.offset
+        if not axis.min_deg < ahead / drive.pulses_per_deg < axis.max_deg:
+            return  # what it leaves the limits by would be another's doing
         drive._move(target, speed, 10.0 * speed)
         self.jogged[drive] = self.now
 

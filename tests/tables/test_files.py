@@ -286,5 +286,5 @@ def test_columns_without_a_header_are_said():
 def test_a_quote_within_a_cell_is_none():
     table = parse("t.csv", b'name,u_a,y\n5" pipe,1,2\n"multi\nline",2,3\n')
     np.testing.assert_array_equal(table.columns(["u_a"])[:, 0], [1.0, 2.0])
-    with pytest.raises(ValueError, match="line 3: a quote .* is never closed"):
+    with pytest.raises(ValueError, match=r"line 3: a quote .* is never closed"):
         parse("t.csv", b'u_a,y,note\n1,2,5" pipe\n3,4,"abc\n5,6,d\n7,8,e\n')
