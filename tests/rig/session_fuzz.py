@@ -650,7 +650,7 @@ def play(
             if code is None:  # the line's own process stops the drives
                 world.dead, world.wire_share = False, 0.0
                 world.injector.clear()
-                with contextlib.suppress(Fault):
+                with contextlib.suppress(Fault, Killed):  # by another of its kills
                     _, drives = make_drives(world.config.bus, world.config.axes)
                     stop.stop_all(drives)
             world.repair()
