@@ -174,8 +174,7 @@ class World:
 
     def advance(self, seconds: float, beats: bool = False) -> None:
         """The world goes on for so long, or until the session is killed in it."""
-        # A wait below the last digit of a clock would never end.
-        end, self._beats = self.now + (seconds and max(seconds, 1e-6)), beats
+        end, self._beats = self.now + at_least(seconds), beats
         while True:
             due = self.events[0][0] if self.events else end
             self.now = max(self.now, min(end, due, self.next_line, self.now + 0.01))
@@ -448,7 +447,7 @@ class FuzzWire(Wire):
             heapq.heappush(self._inbox, (when, data))
 
     def _read(self, seconds: float) -> bytes:
-        end = self.world.now + seconds
+        end = self.world.now + at_least(seconds)
         while True:
             data = b""
             while self._inbox and self._inbox[0][0] <= self.world.now:
@@ -705,6 +704,11 @@ def main(argv: list[str] | None = None) -> int:
     seconds = time.perf_counter() - begun
     print(f"{options.sessions} sessions in {seconds:.0f} s, {broken} broke a promise")
     return int(broken > 0)
+
+
+def at_least(seconds: float) -> float:
+    """A wait that a clock shows: below its last digit one would never end."""
+    return seconds and max(seconds, 1e-6)
 
 
 def shared_memory() -> str | None:
