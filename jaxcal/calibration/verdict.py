@@ -170,22 +170,25 @@ def _stands_still(fit: Fit) -> Reason | None:
 
 def froze(fit: Fitted) -> Reason | None:
     """A reading that repeats over rows of other commands, and nowhere else."""
+    readings = fit.measured
+    least = _EXACT * np.abs(readings).max()
+    repeats = abs(readings[1:] - readings[:-1]) <= least
+    if not repeats.any():
+        return None
     moves = (fit.commands[1:] != fit.commands[:-1]).any(axis=1)
-    said = fit.measured - fit.residuals
-    for name, readings, of_fit in zip(
-        fit.output_names, fit.measured.T, said.T, strict=True
-    ):
-        least = _EXACT * np.abs(readings).max()
-        same = np.flatnonzero((np.abs(np.diff(readings)) <= least) & moves)
-        if len(same) < _FROZEN or np.ptp(same) >= len(same) or len(same) == len(moves):
-            continue
-        if np.ptp(of_fit[same]) <= 1e3 * least:
-            continue  # as a machine that gives way there
-        return Reason(
-            f"{name} reads {_short(readings[same[0]])} in every row from {same[0]} to "
-            f"{same[-1] + 1}, and no other repeats: the sensor froze.",
-            "measure these rows (counted from 0) again, or leave them out",
-        )
+    repeats &= moves[:, None]
+    counts = repeats.sum(axis=0)
+    for j in ((counts >= _FROZEN) & (counts < len(moves))).nonzero()[0]:
+        (same,) = repeats[:, j].nonzero()
+        said = (readings - fit.residuals)[same, j]
+        # The rows follow one another, and no machine gives way there.
+        if np.ptp(same) < len(same) and np.ptp(said) > 1e3 * least:
+            return Reason(
+                f"{fit.output_names[j]} reads {_short(readings[same[0], j])} in every "
+                f"row from {same[0]} to {same[-1] + 1}, and no other repeats: the "
+                "sensor froze.",
+                "measure these rows (counted from 0) again, or leave them out",
+            )
     return None
 
 

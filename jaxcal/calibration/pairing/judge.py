@@ -91,10 +91,12 @@ class Mispairing:
 
 def mispairing(fit: Fit) -> Mispairing | None:
     """How the measurements of a calibration were mispaired; None: they were not."""
-    if len(fit.commands) < LEAST or froze(fit):
+    if len(fit.commands) < LEAST:
         return None
     lack, seen = fit.lack_of_fit() if fit.noise_known else 0.0, None
     if lack is not None and lack <= 1e-3 and not _plainly_right(fit):
+        if froze(fit):
+            return None
         seen = _found(of_fit(fit), fit.input_names, fit.output_names, fit.measured_unit)
     if seen is None and not fit.model.linear and fit.model.default_noise() is None:
         return _taken_up(fit)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxcal.calibration.pairing.fit import fitted, predicted
 from jaxcal.calibration.pairing.judge import LEAST, RATIO, benign_fits, better, of_fit
 from jaxcal.calibration.pairing.table import as_it_is
-from jaxcal.calibration.verdict import Reason, Verdict, bends, froze, in_rows
+from jaxcal.calibration.verdict import Reason, Verdict, bends, in_rows
 from jaxcal.checks import in_words
 
 if TYPE_CHECKING:
@@ -27,9 +27,9 @@ def against(verdict: Verdict, fit: Calibration) -> Verdict:
     """The verdict of the fit by itself, which no calibration passes of a mispaired
     table, outliers that hide in its noise, or a curve."""
     pairing = fit.mispairing
-    if pairing is None and froze(fit):
-        return verdict
     if pairing is None:
+        if verdict.reasons and "froze" in verdict.reasons[0]:
+            return verdict
         follow = ("outlier", "The noise you gave")  # from these rows, or the curve
         others = tuple(
             text for text in verdict.reasons if not any(x in text for x in follow)
@@ -61,8 +61,9 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     of them is an outlier. A model of which nothing is known before is asked, where
     drift and curves explain the rows no better.
     """
-    few = fit.residuals.size < _READINGS * fit.free.sum()
-    if len(fit.commands) < LEAST or few or not _uneven(fit):
+    if len(fit.commands) < LEAST or not _uneven(fit):
+        return None
+    if fit.residuals.size < _READINGS * fit.free.sum():
         return None
     table = of_fit(fit)
     if table is None or table.precision[table.free].any():
