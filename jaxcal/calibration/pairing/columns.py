@@ -33,6 +33,7 @@ _UNITS = {
     "is too large by 100": 0.01,
 }
 _COLUMNS = 6  # changes of columns that are fitted one by one
+_MOST = 30  # columns that are tried one by one
 _PLACES = 2  # of a sensor, that are tried
 _KINDS = np.log(10.0)
 _ROWS = 50  # that are predicted in each unit
@@ -119,14 +120,15 @@ def _kinds_of_columns(
         if of_readings and not table.measured.any():
             continue
         kinds: list[tuple[str, list[int], float]] = []  # words, columns and factor
-        for i in range(count):
+        singly = range(count if count <= _MOST else 0)  # no trajectory's readings
+        for i in singly:
             for what, factor in {"has the other sign": -1.0, **units}.items():
                 kinds.append((f"{names[i]} {what}", [i], factor))
         side = "the readings" if of_readings else "the commands"
         for what, factor in units.items() if count > 1 else ():
             every = f"every column of {side} {what}"
             kinds.append((every, [*range(count)], factor))
-        for i, j in itertools.combinations(range(count), 2):
+        for i, j in itertools.combinations(singly, 2):
             both = f"{names[i]} and {names[j]}"
             kinds.append((f"{both} are exchanged", [i, j], 1.0))
             if not of_readings:
