@@ -227,18 +227,22 @@ class Chains(Model):
 
     @property
     def num_inputs(self) -> int:
+        """n."""
         return len(self.inputs)
 
     @property
     def num_outputs(self) -> int:
+        """q, of the sensor that reads most."""
         return max(arm.num_outputs for arm in self.chains)
 
     @property
     def nominal(self) -> Array:
+        """(p,)."""
         return np.asarray(self._gather([arm.nominal for arm in self.chains]))
 
     @property
     def units(self) -> tuple[str, ...]:
+        """p units, as of ``SerialChain``."""
         units = [np.array(arm.units, dtype=object) for arm in self.chains]
         return tuple(self._gather(units))
 

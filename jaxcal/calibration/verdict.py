@@ -181,6 +181,8 @@ def froze(fit: Fitted) -> Reason | None:
     for j in ((counts >= _FROZEN) & (counts < len(moves))).nonzero()[0]:
         (same,) = repeats[:, j].nonzero()
         said = (readings - fit.residuals)[same, j]
+        if readings[same[0], j] == 0.0 and not fit.model.linear:
+            continue  # contacts, beside readings of another kind
         # The rows follow one another, and no machine gives way there.
         if np.ptp(same) < len(same) and np.ptp(said) > 1e3 * least:
             return Reason(

@@ -72,14 +72,17 @@ class Dataset:
 
     @property
     def num_episodes(self) -> int:
+        """E."""
         return self.candidates.shape[0]
 
     @property
     def num_candidates(self) -> int:
+        """M."""
         return self.candidates.shape[1]
 
     @property
     def num_inputs(self) -> int:
+        """n."""
         return self.candidates.shape[2]
 
     @property

@@ -75,6 +75,7 @@ class Evaluation(abc.ABC):
         return result.values - self.reference[:, None]
 
     def rows(self) -> tuple[MethodNumbers, ...]:
+        """The numbers of every method."""
         return tuple(
             MethodNumbers(r.method, r.checkpoint, self.summary(r)) for r in self.results
         )

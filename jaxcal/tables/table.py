@@ -246,15 +246,15 @@ class Table:
         cells = self.labels.get(names[0])
         if cells is None:
             numbers = self.values[:, self.names.index(names[0])].tolist()
-            cells = [f"{x:g}" if x == x else "" for x in numbers]
+            words = [f"{x:g}" if x == x else "an empty cell" for x in numbers]
         else:
+            words = [repr(cell) for cell in cells]
             numbers = [(truths_of([cell]) or [np.nan])[0] for cell in cells]
-        for line, cell, number in zip(self.lines, cells, numbers, strict=True):
+        for line, word, number in zip(self.lines, words, numbers, strict=True):
             if number not in (0.0, 1.0):
                 raise ValueError(
                     f"{self.source}: {self.row} {line}, {names[0]} must be 1 or 0, "
-                    f"TRUE or FALSE, or yes or no, got "
-                    + (repr(cell) if cell else "an empty cell")
+                    f"TRUE or FALSE, or yes or no, got {word}"
                 )
         return np.array(numbers) == 1.0
 

@@ -202,9 +202,10 @@ class Device:
             self._check_fit(drive, reset_alarms)
             if self.config.motion.mirror_limits:
                 drive.mirror_limits()
+        # From here on nothing is to move it before the first move.
+        self.rest = tuple(drive.last.position for drive in self.drives if drive.last)
         self.imu.latest()
         self.line_watch.apply()
-        self.rest = self.positions()  # nothing is to move it before the first move
         self.armed = True
         self.heartbeat.start()
 

@@ -497,7 +497,7 @@ HEAD = "episode,candidate,u_x,u_y,u_z"
             "episode 0 has 2, episode 7 has 1",
         ),
         (f"{HEAD},available\n0,0,1,2,3,yes", "line 2, column 'available' must hold a"),
-        (f"{HEAD},available\n0,0,1,2,3,2", "line 2, available must be 0 or 1"),
+        (f"{HEAD},available\n0,0,1,2,3,2", "line 2, available must be 1 or 0"),
         (f'{HEAD}\n0,0,1,2,"3\n0,1,1,2,3', "line 2"),
     ],
 )

@@ -234,6 +234,7 @@ class Sensor(abc.ABC):
         return np.zeros(0), np.zeros((0, len(parameters)))
 
     def stds(self, length: float) -> Array:
+        """(q,) standard deviations of the readings."""
         noise = self.usual_noise(length) if self.noise is None else self.noise
         std = numbers("noise of the sensor", noise)
         q = len(self.outputs)

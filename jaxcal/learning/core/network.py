@@ -59,6 +59,7 @@ class Network(nn.Module):
         raise NotImplementedError
 
     def decode(self, memory: jax.Array, decision: Any) -> Scores:
+        """(..., M) logits, masked, and (...,) value."""
         raise NotImplementedError
 
     def lookahead_logits(self, decision: Any) -> Scores:

@@ -112,10 +112,12 @@ class Postures:
     network: Network
 
     def init(self, key: jax.Array) -> Any:
+        """Parameters before training."""
         m, n = jax.eval_shape(self.task.reset, key).candidates.shape
         return initial(self.network, key, m, n, self.task.num_decisions)
 
     def with_config(self, config: EpisodesConfig) -> Postures:
+        """This learner with another configuration."""
         return dataclasses.replace(self, config=config)
 
     def begin(self, keys: jax.Array) -> jax.Array:
@@ -155,6 +157,7 @@ class Postures:
     def loss(
         self, params: Any, experience: Batch, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
+        """PPO loss of whole episodes."""
         score = jax.vmap(functools.partial(self._score, params))
         return surrogate(
             self.config, *score(experience.observations), experience, update_index

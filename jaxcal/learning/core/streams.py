@@ -84,9 +84,11 @@ class Streams:
     network: nn.Module  # of what is observed: masked logits (..., A), values (...)
 
     def with_config(self, config: StreamsConfig) -> Streams:
+        """This learner with another configuration."""
         return dataclasses.replace(self, config=config)
 
     def init(self, key: jax.Array, task: Any) -> Any:
+        """Parameters before training."""
         state = self.environment.reset(task, key)
         return self.network.init(key, self.environment.observe(task, state, key))
 
@@ -118,6 +120,7 @@ class Streams:
     def loss(
         self, params: Any, experience: Batch, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
+        """PPO loss of some streams."""
         logits, value = cast(Any, self.network.apply(params, experience.observations))
         return surrogate(self.config, logits, value, experience, update_index)
 

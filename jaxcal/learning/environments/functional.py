@@ -116,6 +116,7 @@ class FunctionalEnv(abc.ABC):
 
     @property
     def observation_size(self) -> int:
+        """Length of an observation."""
         return int(self._shape(self.observation).shape[0])
 
     def _shape(self, function: Any) -> Any:
@@ -168,10 +169,12 @@ class FunctionalEnv(abc.ABC):
 
     @property
     def name(self) -> str:
+        """Name of the environment."""
         return type(self).__name__
 
     @property
     def default_params(self) -> EnvParams:
+        """Parameters that cut nothing off."""
         return EnvParams(self.longest)
 
     def step_env(
@@ -189,6 +192,7 @@ class FunctionalEnv(abc.ABC):
     def observe(
         self, key: Any, state: Any, action: Any = None, params: Any = None
     ) -> jax.Array:
+        """``observation`` of a state."""
         return self.observation(state)
 
     def is_truncated(self, state: Any, params: EnvParams | None = None) -> jax.Array:

@@ -77,6 +77,7 @@ class Task:
 
     @property
     def draw(self) -> CandidateSource:
+        """key -> (M, n) candidates and (M,) available."""
         if self.given is not None:
             return self.given.source(self.environment)
         from jaxcal.learning.environments import scenarios
@@ -85,6 +86,7 @@ class Task:
 
     @property
     def num_decisions(self) -> int:
+        """K, choices of an episode."""
         return self.environment.num_selected
 
     @property
@@ -93,6 +95,7 @@ class Task:
         return self.environment.reward_scale * self.environment.num_outputs
 
     def reset(self, key: jax.Array) -> SelectionState:
+        """A new episode with fresh candidates."""
         from jaxcal.learning.environments import selection
 
         return selection.reset(key, self.environment, self.draw)
@@ -100,6 +103,7 @@ class Task:
     def step(
         self, state: SelectionState, action: jax.Array
     ) -> tuple[SelectionState, jax.Array, jax.Array]:
+        """Choose one posture: the next state, () reward, () bool done."""
         from jaxcal.learning.environments import selection
 
         return selection.step(state, action, self.environment)

@@ -47,6 +47,7 @@ class TrainConfig(RunConfig):
 
     @property
     def num_imitated(self) -> int:
+        """Updates that imitate, before the others."""
         return round(self.imitation * self.ppo.num_updates)
 
     @property

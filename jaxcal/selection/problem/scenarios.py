@@ -203,6 +203,7 @@ class Worst(ScenarioCriterion):
 
     @property
     def says(self) -> str:
+        """Its value in words."""
         if self.of_efficiency:
             return f"least {self.each.name}-efficiency"
         return super().says
