@@ -203,7 +203,7 @@ class Worst(ScenarioCriterion):
 
     @property
     def says(self) -> str:
-        """Its value in words."""
+        """The criterion, in words."""
         if self.of_efficiency:
             return f"least {self.each.name}-efficiency"
         return super().says
