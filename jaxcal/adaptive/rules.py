@@ -116,7 +116,7 @@ class Rule(abc.ABC):
 
         ``expected``: their gains, seconds and uses, (A,) each.
         """
-        raise NotImplementedError("a Rule defines price, or judged")
+        raise NotImplementedError("a Rule defines price, or judged")  # one of both
 
     def judged(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array

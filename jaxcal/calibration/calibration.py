@@ -113,7 +113,8 @@ class Calibration(Fit):
         of ``identify`` use it."""
         from jaxcal.calibration.pairing import against
 
-        return against(self.model.verdict(self) or verdict(self), self)
+        own = self.model.verdict(self) or verdict(self)
+        return against(own, self, self.mispairing)
 
     @functools.cached_property
     def mispairing(self) -> Mispairing | None:

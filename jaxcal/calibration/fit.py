@@ -235,8 +235,14 @@ class Fit:
     def _say_far(self, commands: ArrayLike) -> None:
         points = self.points("commands", commands, self.num_inputs)
         rows = points.reshape(-1, self.num_inputs)
-        sides = [(self.input_names, rows, self.commands)]
-        say_far("command", self.loss_weights > 0.0, sides, stacklevel=4)
+        sides = [(self.input_names, rows, self._range)]
+        say_far("command", slice(None), sides, stacklevel=4)
+
+    @functools.cached_property
+    def _range(self) -> Array:
+        """(2, n) the least and the largest command that counts."""
+        used = self.commands[self.loss_weights > 0.0]
+        return np.stack([used.min(axis=0), used.max(axis=0)])
 
     def predict_std(
         self, commands: ArrayLike, *, new_measurement: bool = False

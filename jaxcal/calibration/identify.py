@@ -15,12 +15,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.fit_model import fit_model, require_fitting
 from jaxcal.calibration.pairing import of_unfitted
-from jaxcal.calibration.verdict import CalibrationWarning, between_sessions
+from jaxcal.calibration.verdict import CalibrationWarning
 from jaxcal.checks import (
     Array,
     array_of,
@@ -234,7 +234,7 @@ def _with_sessions(calibration: Calibration, labels: ArrayLike) -> Calibration:
             f"sessions must be two or more labels, of {len(calibration.commands)} rows,"
             f" got shape {np.shape(labels)} and {len(names)} labels"
         )
-    std = between_sessions(calibration, which).tolist()
+    std = _between_sessions(calibration, which).tolist()
     about = {"count": len(names), "std": std}
     provenance = {**calibration.provenance, "sessions": about}
     return dataclasses.replace(calibration, provenance=provenance)
@@ -298,3 +298,27 @@ def _provenance(
         "data_sha256": hashlib.sha256(content).hexdigest(),
         "notes": noted,
     }
+
+
+def _between_sessions(fit: Calibration, labels: NDArray[np.intp]) -> Array:
+    """(m,) standard deviation of readings of another session, beyond what is expected.
+    Each session of ``labels`` (N,) is predicted from a fit of the others; a ValueError
+    where none of these determines the model."""
+    square, expected = [], []
+    for label in np.unique(labels):
+        try:
+            trial = fit.again(fit.model, fit.stated_prior, labels != label)
+        except ValueError:
+            continue
+        rows = (labels == label) & (fit.loss_weights > 0.0)
+        if trial.noise_std is not None and rows.any():
+            commands = fit.commands[rows]
+            off = fit.model.wrapped(
+                fit.measured[rows] - trial.outputs_at(commands), commands
+            )
+            square.append(off**2)
+            expected.append(trial.predict_std(commands, new_measurement=True) ** 2)
+    if not square:
+        raise ValueError("sessions: each fit without one session must be possible")
+    excess = np.vstack(square).mean(axis=0) - np.vstack(expected).mean(axis=0)
+    return np.sqrt(excess.clip(0.0))

@@ -11,14 +11,12 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.checks import Array
 from jaxcal.late import late
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.calibration import Calibration as Fit
-    from jaxcal.calibration.fit import Fit as Fitted
+    from jaxcal.calibration.fit import Fit
 
 UNLIKELY = 1e-4  # p-value of residuals under the noise that was given
 _CHANCE = 0.01  # that readings of nothing pass for a fit
@@ -30,6 +28,7 @@ _BENT, _BENT_MORE = 2.0, 3.0  # times the noise without squares and products of 
 # commands; of a model that is a curve itself
 _SAMPLE, _TERMS = 2000, 600  # readings; twice these terms
 _FROZEN = 3  # readings after the first that repeat it
+_STEPS = 20.0  # of a sensor between readings: with fewer, some repeat by chance
 _EXACT = 1e-12  # of the largest reading: rounding, and no noise of a sensor
 _UNITS = np.outer([1.0, -1.0], [1.0, np.pi / 180.0, 180.0 / np.pi, 1e3, 1e-3]).ravel()
 _NAMED, _DIGITS = 6, 7  # rows in one sentence; decimals of a table
@@ -90,30 +89,6 @@ def left_out(fit: Fit) -> Array:
     return np.asarray(np.linalg.solve(root, white)[..., 0])
 
 
-def between_sessions(fit: Fit, labels: NDArray[np.intp]) -> Array:
-    """(m,) standard deviation of readings of another session, beyond what is expected.
-    Each session of ``labels`` (N,) is predicted from a fit of the others; a ValueError
-    where none of these determines the model."""
-    square, expected = [], []
-    for label in np.unique(labels):
-        try:
-            trial = fit.again(fit.model, fit.stated_prior, labels != label)
-        except ValueError:
-            continue
-        rows = (labels == label) & (fit.loss_weights > 0.0)
-        if trial.noise_std is not None and rows.any():
-            commands = fit.commands[rows]
-            off = fit.model.wrapped(
-                fit.measured[rows] - trial.outputs_at(commands), commands
-            )
-            square.append(off**2)
-            expected.append(trial.predict_std(commands, new_measurement=True) ** 2)
-    if not square:
-        raise ValueError("sessions: each fit without one session must be possible")
-    excess = np.vstack(square).mean(axis=0) - np.vstack(expected).mean(axis=0)
-    return np.sqrt(excess.clip(0.0))
-
-
 class Reason(NamedTuple):
     """What speaks against a calibration, and what to do about it."""
 
@@ -168,10 +143,10 @@ def _stands_still(fit: Fit) -> Reason | None:
     )
 
 
-def froze(fit: Fitted) -> Reason | None:
+def froze(fit: Fit) -> Reason | None:
     """A reading that repeats over rows of other commands, and nowhere else."""
     readings = fit.measured
-    least = _EXACT * np.abs(readings).max()
+    least = _EXACT * np.abs(readings).max(axis=0)
     repeats = abs(readings[1:] - readings[:-1]) <= least
     if not repeats.any():
         return None
@@ -183,8 +158,9 @@ def froze(fit: Fitted) -> Reason | None:
         said = (readings - fit.residuals)[same, j]
         if readings[same[0], j] == 0.0 and not fit.model.linear:
             continue  # contacts, beside readings of another kind
-        # The rows follow one another, and no machine gives way there.
-        if np.ptp(same) < len(same) and np.ptp(said) > 1e3 * least:
+        if np.ptp(same) >= len(same) or np.ptp(said) <= 1e3 * least[j]:
+            continue  # not one run of rows; a machine that gives way there
+        if not _coarse(readings[:, j]):
             return Reason(
                 f"{fit.output_names[j]} reads {_short(readings[same[0], j])} in every "
                 f"row from {same[0]} to {same[-1] + 1}, and no other repeats: the "
@@ -192,6 +168,16 @@ def froze(fit: Fitted) -> Reason | None:
                 "measure these rows (counted from 0) again, or leave them out",
             )
     return None
+
+
+def _coarse(readings: Array) -> bool:
+    """Whether readings (N,) are so few steps of a sensor apart that some repeat."""
+    readings = (readings / np.abs(readings).max()).round(12)
+    levels = np.unique(readings)
+    step = float(np.diff(levels).min(initial=np.inf))
+    counts = (levels - levels[0]) / step
+    whole = np.abs(counts - counts.round()).max() < 1e-3
+    return bool(whole and np.median(np.abs(np.diff(readings))) < _STEPS * step)
 
 
 def computed(fit: Fit) -> Reason | None:
@@ -441,7 +427,9 @@ def in_rows(rows: Sequence[int]) -> str:
 
 def not_invertible(fit: Fit) -> Reason | None:
     """A fit whose inverse ``command_for`` refuses, whatever is desired."""
-    why = fit.no_inverse()
+    from jaxcal.calibration.inverse import no_inverse
+
+    why = no_inverse(fit)
     if not why:
         return None
     return Reason(

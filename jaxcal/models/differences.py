@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxcal.checks import Array, aligned
-from jaxcal.models.predictions import within_half
+from jaxcal.models.model import within_half
 
 Evaluate = Callable[[Array], Array]  # points (S, p) -> values (S, N, q), NaN: refused
 

@@ -17,9 +17,9 @@ from jaxcal.models.model import (
     Theta,
     as_commands,
     as_parameters,
+    checked_periods,
     parameter_names,
 )
-from jaxcal.models.predictions import checked_periods
 
 
 class FromJax(Model):

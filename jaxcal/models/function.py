@@ -28,9 +28,9 @@ from jaxcal.models.model import (
     as_commands,
     as_parameters,
     by_name,
+    checked_periods,
     parameter_names,
 )
-from jaxcal.models.predictions import checked_periods
 from jaxcal.models.runs import CommandLine, Runs
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
 

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import Array, array_of, axis_names
-from jaxcal.models.predictions import within_half
+from jaxcal.checks import Array, array_of, axis_names, one_or_each, require_none
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.tables import COMMANDS, header_of, of_frame
@@ -251,7 +250,7 @@ class Model(abc.ABC):
 
     def blocks(self, commands: ArrayLike) -> Array:
         """(..., N, 1, r) of each output by itself, with unit noise."""
-        raise NotImplementedError("the outputs share no regressor")
+        raise NotImplementedError("the outputs share no regressor")  # multiplicity 0
 
     def affine(self, parameters: Array) -> tuple[Array, Array] | None:
         """A (m, n) and b (m,) of a model ``y = A u + b``; None for any other."""
@@ -435,3 +434,19 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
     if measured is None:
         raise ValueError("measured is missing: the readings at each of the commands")
     return commands, measured, is_recording
+
+
+def within_half(off: Array, periods: ArrayLike | None) -> Array:
+    """(..., q) differences, those of readings that wrap within half a period (q,)."""
+    if periods is None:
+        return off
+    wraps = np.isfinite(periods)
+    whole = np.where(wraps, periods, 1.0)
+    return np.asarray(np.where(wraps, off - whole * np.round(off / whole), off))
+
+
+def checked_periods(periods: ArrayLike, count: int) -> Array:
+    """(q,) positive numbers, one for all or one each, inf of what does not wrap."""
+    given = one_or_each("periods", periods, count)
+    require_none(~(given > 0.0), given, "periods must be positive (inf: does not wrap)")
+    return given

@@ -1,7 +1,4 @@
-"""What a model predicts, its derivatives, and where it has none: checked answers.
-
-Differences of readings that wrap, as an angle does at 180 degrees, are taken here too.
-"""
+"""What a model predicts, its derivatives, and where it has none: checked answers."""
 
 from __future__ import annotations
 
@@ -10,9 +7,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from jaxcal.checks import Array, in_words, one_or_each, require_none
+from jaxcal.checks import Array, in_words
 from jaxcal.information.singular import flat
 
 if TYPE_CHECKING:
@@ -108,19 +105,3 @@ def without_effect(jacobian: Array, sizes: Array) -> NDArray[np.bool_]:
 def _require_shape(method: str, found: Array, shape: tuple[int, ...]) -> None:
     if found.shape != shape:
         raise ValueError(f"model.{method} must return {shape}, got {found.shape}")
-
-
-def within_half(off: Array, periods: ArrayLike | None) -> Array:
-    """(..., q) differences, those of readings that wrap within half a period (q,)."""
-    if periods is None:
-        return off
-    wraps = np.isfinite(periods)
-    whole = np.where(wraps, periods, 1.0)
-    return np.asarray(np.where(wraps, off - whole * np.round(off / whole), off))
-
-
-def checked_periods(periods: ArrayLike, count: int) -> Array:
-    """(q,) positive numbers, one for all or one each, inf of what does not wrap."""
-    given = one_or_each("periods", periods, count)
-    require_none(~(given > 0.0), given, "periods must be positive (inf: does not wrap)")
-    return given

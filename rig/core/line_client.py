@@ -30,6 +30,7 @@ END_S = 2.0  # for the process to end
 GRACE_S = 0.1  # for one whose channels are closed to be gone
 LATE = "does not answer"
 # Errors that the line's process reports and this side raises again, by name.
+# Errors that a line raises of its own accord, by the names that cross the pipe.
 KINDS = {kind.__name__: kind for kind in (LimitError, NotImplementedError, ValueError)}
 GONE = "Find out who ended it. The session stops its drives"
 

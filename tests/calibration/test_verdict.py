@@ -588,3 +588,12 @@ def test_a_sensor_that_froze_is_told(outputs):
         verdict = jaxcal.identify(u, y).verdict
     assert not verdict.good
     assert "in every row from 11 to 19" in verdict.reasons[0]
+
+
+def test_a_coarse_sensor_on_a_plateau_did_not_freeze():
+    u = np.linspace(-1.0, 1.0, 24)[:, None]
+    y = np.round(8.0 * u**3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        verdict = jaxcal.identify(u, y, model=jaxcal.models.Polynomial(3, 1)).verdict
+    assert "froze" not in str(verdict)

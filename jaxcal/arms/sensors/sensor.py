@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from jaxcal.checks import Array, numbers
-from jaxcal.models.model import Quantity
-from jaxcal.models.predictions import within_half
+from jaxcal.models.model import Quantity, within_half
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 BASE = tuple(f"base {axis}" for axis in AXES)

@@ -32,6 +32,7 @@ _UNITS = {
     "is too small by 100": 100.0,
     "is too large by 100": 0.01,
 }
+_DECADES = {0.01, 0.1, 10.0, 100.0}  # by which a nominal may be off
 _COLUMNS = 6  # changes of columns that are fitted one by one
 _MOST = 30  # columns that are tried one by one
 _PLACES = 2  # of a sensor, that are tried
@@ -74,9 +75,10 @@ def by_nominal(
     kinds = [
         hypothesis
         for hypothesis in _kinds_of_columns(table, inputs, outputs)
-        if hypothesis.change
-        and not hypothesis.change.words.endswith(("by 10", "by 100"))
+        if hypothesis.change and _DECADES.isdisjoint(hypothesis.change.factors)
     ]
+    if not kinds:
+        return None
     shares = [_unexplained(table, hypothesis, rows) for hypothesis in kinds]
     best = min(range(len(kinds)), key=lambda i: shares[i].sum())
     if (shares[best] >= _LEFT_OVER).any():

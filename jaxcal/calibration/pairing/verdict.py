@@ -8,13 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal.calibration.pairing.fit import fitted, predicted
-from jaxcal.calibration.pairing.judge import LEAST, RATIO, benign_fits, better, of_fit
+from jaxcal.calibration.pairing.judge import (
+    LEAST,
+    RATIO,
+    Mispairing,
+    benign_fits,
+    better,
+    of_fit,
+)
 from jaxcal.calibration.pairing.table import as_it_is
 from jaxcal.calibration.verdict import Reason, Verdict, bends, in_rows
 from jaxcal.checks import in_words
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.calibration import Calibration
     from jaxcal.calibration.fit import Fit
 
 _OFF = 6.0  # times the noise of the others
@@ -23,10 +29,9 @@ _SAMPLE = 5000  # rows
 _READINGS = 3  # for each parameter
 
 
-def against(verdict: Verdict, fit: Calibration) -> Verdict:
+def against(verdict: Verdict, fit: Fit, pairing: Mispairing | None) -> Verdict:
     """The verdict of the fit by itself, which no calibration passes of a mispaired
     table, outliers that hide in its noise, or a curve."""
-    pairing = fit.mispairing
     if pairing is None:
         if verdict.reasons and "froze" in verdict.reasons[0]:
             return verdict

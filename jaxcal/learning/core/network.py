@@ -18,6 +18,9 @@ import jax.numpy as jnp
 Scores = tuple[jax.Array, jax.Array]
 """(..., M) masked logits and (...,) value."""
 
+_OWN = "a Network of one's own defines this"
+_LAST = "a Network with num_unlearned > 0 defines this"
+
 
 class Network(nn.Module):
     """Scores candidates; features are trees of arrays."""
@@ -34,7 +37,7 @@ class Network(nn.Module):
 
     def candidate_features(self, candidates: jax.Array, usable: jax.Array) -> Any:
         """Features of sets (..., M, n); (..., M) bool usable: available or chosen."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def decision_features(
         self,
@@ -52,19 +55,19 @@ class Network(nn.Module):
             count: () choices made: the number 0, or traced, so that decisions share a
                 program.
         """
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def encode(self, features: Any) -> jax.Array:
         """(..., M, width) memory of a set."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def decode(self, memory: jax.Array, decision: Any) -> Scores:
         """(..., M) logits, masked, and (...,) value."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)  # abstract
 
     def lookahead_logits(self, decision: Any) -> Scores:
         """Logits as of ``decode``, for one of the last ``num_unlearned`` choices."""
-        raise NotImplementedError("a Network with num_unlearned > 0 defines this")
+        raise NotImplementedError(_LAST)  # abstract where num_unlearned is 0
 
     def __call__(
         self, candidates: jax.Array, available: jax.Array, chosen: jax.Array
