@@ -63,7 +63,7 @@ def test_a_turntable_is_calibrated_with_two_postures(tmp_path):
 @pytest.mark.slow
 def test_a_gimbal_is_calibrated_with_three(tmp_path):
     _, summary, said = calibrated(parse_config(axes_text(GIMBAL)), tmp_path)
-    assert len(summary["postures"]) == 3 and "all six at once" in " ".join(said)
+    assert len(summary["postures"]) == 3 and "all six together" in " ".join(said)
 
 
 @pytest.mark.slow
