@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar
 from jaxcal.calibration import Calibration
 from jaxcal.checks import Array
 from jaxcal.commands.arms import in_degrees, is_recording
-from jaxcal.tables import COMMANDS, Table, read_table
+from jaxcal.tables import COMMANDS, Table
 
 ReportFolder = Annotated[
     str,
@@ -25,7 +25,7 @@ class ReportOptions:
     """The page of a calibration, and what it is compared with."""
 
     TITLE: ClassVar[str] = "the page of a calibration"
-    RARE: ClassVar[Any] = {"against", "certificate", "at"}
+    RARE: ClassVar[Any] = {"against", "certificate"}
 
     report: ReportFolder = ""
     against: Annotated[
@@ -37,16 +37,11 @@ class ReportOptions:
         "the measured unit, for the budget on the page",
         "U",
     ] = None
-    at: Annotated[
-        str | None,
-        "table of commands; the page gives the uncertainty budget of their predictions",
-        "FILE",
-    ] = None
 
     def require(self) -> None:
         """Refuse options of a page without a page."""
         if not self.report and self != ReportOptions():
-            raise ValueError("--against, --certificate and --at need --report FOLDER")
+            raise ValueError("--against and --certificate need --report FOLDER")
 
     def written(self, calibration: Calibration, files: Sequence[str | None]) -> bool:
         """Write the page, if it was asked for; whether nothing on it is bad."""
@@ -57,14 +52,10 @@ class ReportOptions:
             from jaxcal.reports.budget import Source
 
             sources = [Source.certificate("certificate", self.certificate)]
-        at = None
-        if self.at is not None:
-            at = commands_for(calibration, read_table(self.at))[1]
         return calibration.report(
             self.report,
             before=Calibration.load(self.against) if self.against else None,
             sources=sources,
-            at=at,
             files=[path for path in files if path and os.path.isfile(path)],
         )
 

@@ -308,37 +308,32 @@ def _gain(calibration: Fit, width: int) -> Array:
     """(P, N, m) how far the parameters move with each reading, to first order."""
     estimated = calibration.estimated_commands
     at = calibration.commands if estimated is None else estimated
-    slopes = calibration.linear(at)[0][..., :width]
     free = calibration.free[:width] > 0.0
-    slopes = slopes * free
-    weight = calibration.loss_weights[:, None] / np.maximum(
-        calibration.require_noise("budget") ** 2, 1e-300
-    )
-    rows = slopes * np.sqrt(weight)[..., None]
-    rows = rows.reshape(-1, width)
+    slopes = calibration.linear(at)[0][..., :width] * free
+    variance = np.maximum(calibration.require_noise("budget") ** 2, 1e-300)
+    root = np.sqrt(calibration.loss_weights[:, None] / variance)
+    rows = (slopes * root[..., None]).reshape(-1, width)
     prior_root = np.sqrt(calibration.prior_precision[:width] * free)
     whole = np.concatenate([rows, np.diag(prior_root)])
     size = np.sqrt((whole**2).sum(axis=0))
     size[size == 0.0] = 1.0
     inverse = np.linalg.pinv(whole / size)[:, : len(rows)] / size[:, None]
-    return np.asarray(inverse.reshape(width, *weight.shape) * np.sqrt(weight))
+    return np.asarray(inverse.reshape(width, *root.shape) * root)
 
 
 def _squares(calibration: Fit, source: Source, results: _Results, gain: Any) -> Array:
     """(R,) variances of the results by one source."""
-    m = calibration.num_outputs
-    measured = calibration.measured
+    m, measured = calibration.num_outputs, calibration.measured
     moved = np.zeros(len(results.slopes))
-    for name, shape in (("offset", np.ones_like(measured)), ("scale", measured)):
-        value = getattr(source, name)
-        if not np.any(value):
-            continue
-        size = one_or_each(f"{name} of {source.name}", value, m)
+    kinds: list[tuple[str, Any, Any]] = [
+        ("offset", np.ones_like(measured), 1.0),
+        ("scale", measured, results.readings),
+    ]
+    for name, shape, scaled in kinds:
+        size = one_or_each(f"{name} of {source.name}", getattr(source, name), m)
         # Of each output by itself: (R, m).
         moves = results.slopes @ np.einsum("pnm,nm->pm", gain, shape * size)
         if results.turn is not None:
-            assert results.readings is not None
-            scaled = 1.0 if name == "offset" else results.readings
             moves = moves + results.turn * size * scaled
         moved = moved + (moves**2).sum(axis=1)
     return moved

@@ -83,7 +83,6 @@ def report(
     readings: tuple[ArrayLike, ArrayLike] | None = None,
     before: Fit | None = None,
     sources: Sequence[Source] = (),
-    at: ArrayLike | None = None,
     files: Sequence[str | os.PathLike[str]] = (),
 ) -> bool:
     """Write ``index.html``, ``calibration.json`` and ``verdict.json`` into a folder.
@@ -94,8 +93,6 @@ def report(
         readings: of the check, (N, n) commands and (N, m) readings, shown in a table.
         before: an earlier calibration of the same parameters, to compare with.
         sources: of uncertainty, as in ``budget``.
-        at: (P, n) commands whose predictions get a budget; when not given two that
-            were measured, the one nearest to the mean and the least certain one.
         files: that the calibration was made of, listed with their hashes.
 
     Returns:
@@ -115,13 +112,13 @@ def report(
     if calibration.noise_std is not None:
         budgets = [
             budget(calibration, sources=sources),
-            _of_predictions(calibration, at, sources),
+            _of_predictions(calibration, sources),
         ]
         document["budget"] = budgets[0].to_dict()
         document["budget_of_predictions"] = budgets[1].to_dict()
     if before is not None:
         document["moved"] = moved(calibration, before)
-    page = _page_of(calibration, document, budgets, readings, at)
+    page = _page_of(calibration, document, budgets, readings)
     written = {
         "calibration.json": content,
         "verdict.json": json.dumps(document, indent=1, allow_nan=False) + "\n",
@@ -153,12 +150,9 @@ def _document(calibration: Calibration, check: Check | None) -> dict[str, Any]:
     }
 
 
-def _of_predictions(
-    calibration: Fit, at: ArrayLike | None, sources: Sequence[Source]
-) -> Budget:
-    """The budget at some commands, which are named by their rows."""
-    if at is not None:
-        return budget(calibration, at, sources=sources)
+def _of_predictions(calibration: Fit, sources: Sequence[Source]) -> Budget:
+    """The budget at two measured commands, which are named by their rows: the one
+    nearest to the mean, and the least certain one."""
     commands = calibration.commands
     spread = commands.std(axis=0)
     off = (commands - commands.mean(axis=0)) / np.where(spread > 0.0, spread, 1.0)
@@ -210,7 +204,6 @@ def _page_of(
     document: Mapping[str, Any],
     budgets: Sequence[Budget],
     readings: tuple[ArrayLike, ArrayLike] | None,
-    at: ArrayLike | None,
 ) -> pages.Page:
     sections = [_verdict_section(calibration, document)]
     if readings is not None:
@@ -219,8 +212,8 @@ def _page_of(
         sections.append(_moved_section(calibration, document["moved"]))
     sections.append(_parameter_section(calibration, budgets))
     if budgets:
-        sections.append(_prediction_section(calibration, budgets[1], at))
-    sections += _residual_sections(calibration)
+        sections.append(_prediction_section(calibration, budgets[1]))
+    sections.append(_residual_section(calibration))
     sections.append(_files_section(calibration, document["files"]))
     made = calibration.provenance.get("created", "")
     return pages.Page(
@@ -281,22 +274,15 @@ def _parameter_section(calibration: Fit, budgets: Sequence[Budget]) -> pages.Sec
     return pages.Section("Parameters", blocks, "parameters")
 
 
-def _prediction_section(
-    calibration: Fit, budget: Budget, at: ArrayLike | None
-) -> pages.Section:
+def _prediction_section(calibration: Fit, budget: Budget) -> pages.Section:
     unit = f", {calibration.measured_unit}" if calibration.measured_unit else ""
     text = (
-        f"Uncertainty of the true outputs{unit}, without a reading's noise; rows "
-        "are counted from 0."
+        f"Uncertainty of the true outputs{unit}, without a reading's noise; rows are "
+        "counted from 0. The first row is nearest to the middle of the measured ones, "
+        "the second is the least certain."
     )
-    if at is None:
-        text += (
-            " The first row is nearest to the middle of the measured ones, the second "
-            "is the least certain."
-        )
-    rows = budget.rows()
-    table = pages.Table(rows[0], rows[1:])
-    return pages.Section("Predictions", [text, table], "predictions")
+    head, *rows = budget.rows()
+    return pages.Section("Predictions", [text, pages.Table(head, rows)], "predictions")
 
 
 def _text(value: Any) -> str:
@@ -336,68 +322,35 @@ def _moved_section(
 ) -> pages.Section:
     units = dict(zip(calibration.names, _units(calibration), strict=False))
     ordered = sorted(rows, key=lambda row: -abs(row["deviations"] or 0.0))
-    cells: list[list[pages.Content]] = []
+    cells = []
     for row in ordered:
         times = row["deviations"]
-        shown: pages.Content = "-" if times is None else f"{times:+.2f}"
-        if times is not None and abs(times) > 3.0:
-            shown = pages.Strong(f"{times:+.2f}")
+        shown = "-" if times is None else f"{times:+.2f}"
         values = (f"{row[key]:.6g}" for key in ("before", "after", "difference"))
         unit = [units[row["name"]]] if units else []
         cells.append([row["name"], *values, shown, *unit])
     head = ["", "before", "after", "difference", "standard deviations"]
     head += ["unit"] if units else []
-    note = "The difference divided by its standard deviation; values beyond 3 in bold."
+    note = "The difference divided by its standard deviation, the largest first."
     return pages.Section("What moved", [pages.Table(head, cells), note], "moved")
 
 
-def _residual_sections(calibration: Calibration) -> list[pages.Section]:
+def _residual_section(calibration: Calibration) -> pages.Section:
+    """A picture, and a row for each measurement: residuals, weight and, if the noise is
+    known, leverage and error held out."""
     names, residuals = calibration.output_names, calibration.residuals
     unit = f" ({calibration.measured_unit})" if calibration.measured_unit else ""
-    rows = np.arange(len(residuals), dtype=float)
-    across = {"row": rows} | dict(
-        zip(calibration.input_names, calibration.commands.T, strict=True)
-    )
+    inputs = zip(calibration.input_names, calibration.commands.T, strict=True)
+    across = {"row": np.arange(len(residuals), dtype=float)} | dict(inputs)
     picture = _scatter(across, residuals, names, f"residual{unit}")
-    words = ", ".join(across)
-    table = _residual_table(calibration)
-    figure = pages.Figure(picture, f"residuals against {words}")
-    sections = [pages.Section("Residuals", [figure, table], "residuals")]
-    nominal = nominal_errors(calibration)
-    if nominal is not None:
-        sections.append(_before_and_after(calibration, nominal, unit))
-    return sections
-
-
-def _residual_table(calibration: Calibration) -> pages.Table:
-    """A row for each measurement: residuals, weight and, if it has one, leverage."""
-    names = calibration.output_names
+    figure = pages.Figure(picture, f"residuals against {', '.join(across)}")
     head = [*(f"residual {name}" for name in names), "weight"]
-    columns = [*calibration.residuals.T, calibration.loss_weights]
+    columns = [*residuals.T, calibration.loss_weights]
     if calibration.noise_std is not None:
-        head += [
-            f"{what} {name}" for what in ("leverage", "held-out") for name in names
-        ]
-        columns += [*leverage(calibration).T, *left_out(calibration).T]
-    return _by_row(head, columns)
-
-
-def _before_and_after(
-    calibration: Calibration, nominal: Array, unit: str
-) -> pages.Section:
-    """The length of each error (N, m), nominal and as fitted, held out if possible."""
-    noise_known = calibration.noise_std is not None
-    after = left_out(calibration) if noise_known else calibration.residuals
-    lengths = np.column_stack(
-        [np.linalg.norm(errors, axis=1) for errors in (nominal, after)]
-    )
-    labels = ("before", "after, held out" if noise_known else "after")
-    rows = np.arange(len(lengths), dtype=float)
-    picture = _scatter({"row": rows}, lengths, labels, f"error{unit}")
-    means = lengths.mean(axis=0)
-    text = f"Mean error {means[0]:.3g} before, {means[1]:.3g} {labels[1]}."
-    figure = pages.Figure(picture, "errors before and after")
-    return pages.Section("Before and after", [figure, text], "before")
+        kinds = {"leverage": leverage(calibration), "held-out": left_out(calibration)}
+        head += [f"{kind} {name}" for kind in kinds for name in names]
+        columns += [column for table in kinds.values() for column in table.T]
+    return pages.Section("Residuals", [figure, _by_row(head, columns)], "residuals")
 
 
 def _files_section(calibration: Fit, files: Mapping[str, str]) -> pages.Section:

@@ -47,14 +47,7 @@ class Code:
     text: str
 
 
-@dataclasses.dataclass(frozen=True)
-class Strong:
-    """What must not be overlooked."""
-
-    text: str
-
-
-Inline = str | Link | Badge | Code | Strong
+Inline = str | Link | Badge | Code
 Content = Inline | Sequence[Inline]
 """A piece of text, or several that follow one another"""
 
@@ -73,7 +66,6 @@ class Table:
 
     head: Sequence[Content]
     rows: Sequence[Sequence[Content]]
-    caption: Content = ""
     numeric: bool = True  # all columns but the first are aligned to the right
 
     def __post_init__(self) -> None:
@@ -85,14 +77,11 @@ class Table:
                 )
 
 
-_MEDIA = (("png", b"\x89PNG", 4), ("gif", b"GIF8", 4), ("svg+xml", b"<svg", 1000))
-
-
 @dataclasses.dataclass(frozen=True)
 class Figure:
     """A picture inside the page."""
 
-    data: bytes | str  # an SVG, PNG or GIF file
+    data: bytes  # an SVG file
     alt: str  # what it shows, for readers who do not see it
 
     @property
@@ -100,13 +89,11 @@ class Figure:
         """The file as a data URI.
 
         Raises:
-            ValueError: it is neither SVG nor PNG nor GIF.
+            ValueError: it is not an SVG file.
         """
-        data = self.data.encode() if isinstance(self.data, str) else self.data
-        for media, mark, reach in _MEDIA:
-            if mark in data[:reach]:
-                return f"data:image/{media};base64,{base64.b64encode(data).decode()}"
-        raise ValueError(f"figure {self.alt!r} must be an SVG, PNG or GIF file")
+        if b"<svg" not in self.data[:1000]:
+            raise ValueError(f"figure {self.alt!r} must be an SVG file")
+        return f"data:image/svg+xml;base64,{base64.b64encode(self.data).decode()}"
 
 
 Block = str | Text | Table | Figure
@@ -138,7 +125,7 @@ def render(page: Page) -> str:
 
     Raises:
         MissingExtraError: jinja2 is not installed.
-        ValueError: a figure is not an SVG, PNG or GIF file.
+        ValueError: a figure is not an SVG file.
     """
     return str(_template().render(page=page)).lstrip()
 

@@ -13,7 +13,6 @@ from jaxcal.reports.plots.style import (
     BLACK,
     COLOURS,
     GREY,
-    MARKERS,
     numbered,
     plain_axes,
     points,
@@ -30,17 +29,10 @@ def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
         fronts: ``ParetoFront`` by the name to show.
     """
     for i, (name, front) in enumerate(fronts.items()):
-        colour = COLOURS[i % len(COLOURS)]
-        axes.plot(
-            [point.efficiency for point in front.points],
-            [point.seconds for point in front.points],
-            drawstyle="steps-pre",
-            color=colour,
-            linewidth=1.0,
-            marker=MARKERS[i % len(MARKERS)],
-            markersize=5,
-            label=name,
-        )
+        look = numbered(i) | {"linestyle": "-", "linewidth": 1.0, "markersize": 5}
+        efficiencies = [point.efficiency for point in front.points]
+        seconds = [point.seconds for point in front.points]
+        axes.plot(efficiencies, seconds, drawstyle="steps-pre", label=name, **look)
     axes.set_ylabel("run time (s): travel and settling")
     return _finished(axes, "D-efficiency against the optimum")
 
@@ -68,14 +60,11 @@ def plan(axes: Any, plan: Any) -> Any:
     Args:
         plan: a ``Plan``; the output that is furthest from its target is drawn.
     """
-    series = (
-        ("standard_error", "design found", MARKERS[0], "-", COLOURS[0]),
-        ("least_error", "lower bound", "", ":", GREY),
-    )
     ks = [row.k for row in plan.rows]
-    for field, label, marker, style, colour in series:
-        values = [plan.worst(getattr(row, field)) for row in plan.rows]
-        axes.plot(ks, values, marker=marker, linestyle=style, color=colour, label=label)
+    errors = [plan.worst(row.standard_error) for row in plan.rows]
+    least = [plan.worst(row.least_error) for row in plan.rows]
+    axes.plot(ks, errors, "o-", color=COLOURS[0], label="design found")
+    axes.plot(ks, least, ":", color=GREY, label="lower bound")
     target = plan.accuracy[plan.hardest_output]
     axes.axhline(target, color=BLACK, linewidth=0.8, label="target")
     axes.axvline(plan.k, color=BLACK, linewidth=0.8, linestyle=":")

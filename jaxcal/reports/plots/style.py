@@ -20,19 +20,6 @@ STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1
 MARKERS = ("o", "s", "^", "D", "v", "P")
 GREY = "#7F7F7F"
 BLACK = "#000000"
-DARK = {  # colours of a figure on a dark page
-    "#ffffff": "#1e2129",
-    "#000000": "#e2e4e9",
-    "#262626": "#e2e4e9",
-    "#e6e6e6": "#3b404c",
-    "#f2f2f2": "#2a2e38",  # the sides of a box in 3-D
-    "#ececec": "#2f333e",
-    "#b0b0b0": "#4b5160",
-    "#cccccc": "#4b5160",
-    "#7f7f7f": "#9aa0ad",
-    "#0072b2": "#4aa3df",
-    "#009e73": "#2fc698",
-}
 
 
 def as_files(figure: Figure, *suffixes: str) -> list[bytes]:
@@ -50,22 +37,8 @@ def as_files(figure: Figure, *suffixes: str) -> list[bytes]:
             buffer = io.BytesIO()
             metadata: dict[str, Any] = {"Date": None} if suffix == "svg" else {}
             figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
-            data = buffer.getvalue()
-            files.append(_dark_too(data) if suffix == "svg" else data)
+            files.append(buffer.getvalue())
     return files
-
-
-def _dark_too(svg: bytes) -> bytes:
-    """The SVG file with the colours of a dark page, where the reader's browser is dark.
-
-    matplotlib writes colours into the style of each element; what has none is black.
-    """
-    rules = ["svg{fill:#e2e4e9}"]
-    for light, dark in DARK.items():
-        for use in ("fill", "stroke"):
-            rules.append(f'[style*="{use}: {light}"]{{{use}:{dark}!important}}')
-    style = f"<style>@media screen and (prefers-color-scheme:dark){{{''.join(rules)}}}"
-    return svg.replace(b"<defs>", f"{style}</style><defs>".encode(), 1)
 
 
 def as_bytes(figure: Figure, suffix: str) -> bytes:
