@@ -57,7 +57,7 @@ from jaxcal.adaptive.rules import (
     StateRule,
 )
 from jaxcal.adaptive.session import jit_by_class
-from jaxcal.adaptive.tuning import tune
+from jaxcal.adaptive.tuning import search, tune
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.learning.runtime import cache
 
@@ -136,8 +136,9 @@ def tuned_for_all(seed: int) -> Any:
     tasks = arrays(batch(0))
     units: list[Any] = []
 
-    def nats_of(tasks: Any, rule: Any, keys: Any) -> float:
-        keys = keys.reshape(len(tasks.prior), -1)
+    def nats_of(rule: Any, number: int) -> float:
+        key = jax.random.fold_in(jax.random.key(seed), number)
+        keys = jax.random.split(key, 4 * len(tasks.prior)).reshape(-1, 4)
         if not units:
             both = [_nats_of_each(tasks, r, keys) for r in (Gain(), GainRate())]
             units.append(jnp.maximum(jnp.maximum(*both), 0.05))
@@ -147,10 +148,8 @@ def tuned_for_all(seed: int) -> Any:
         print(f"{number:3} {nats:.4f}", *np.round(dataclasses.astuple(rule), 3),
               flush=True)  # fmt: skip
 
-    return tune(
-        tasks, Shares(1.0, 1.0), episodes=4 * len(tasks.prior), generations=10,
-        population=12, elite=4, seed=seed, nats_of=nats_of, report=report,
-    )  # fmt: skip
+    start = Shares(1.0, 1.0)
+    return search(start, 10, 12, 4, seed, nats_of=nats_of, report=report)
 
 
 def decider_of(method: str, task: GridTask, seed: int, found: dict[str, Any]) -> Any:
@@ -166,7 +165,7 @@ def decider_of(method: str, task: GridTask, seed: int, found: dict[str, Any]) ->
         )
     return {
         "random": Random, "gain": Gain, "rate": GainRate, "shares": lambda: SHARES,
-        "ahead": lambda: fit(task, seed=seed + 1).decider,
+        "ahead": lambda: fit(task, seed=seed + 1),
         "deep": lambda: Ahead(effort=100.0 * AHEAD.effort),
         "priced": lambda: found["priced"], "state": lambda: found["state"],
         "two_step": lambda: TwoStep(SHARES),

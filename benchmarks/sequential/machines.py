@@ -84,7 +84,7 @@ def rows(name: str, options: Options) -> None:
         gain: np.ndarray = compare(task, {name: decider}, options.episodes, 7).gain[0]
         return gain
 
-    ahead = fit(task, seed=2).decider
+    ahead = fit(task, seed=2)
     least = played(ahead)
 
     def row(method: str, decider: Any, trained: str = "") -> None:
@@ -106,7 +106,7 @@ def rows(name: str, options: Options) -> None:
         row(f"`{method}`", decider)
     for seed in range(options.seed, options.seed + options.seeds):
         config = PolicyConfig(
-            path, base, (values,), seed=seed,
+            path, base, values, seed=seed,
             ppo=dataclasses.replace(PPO, num_updates=options.updates),
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:

@@ -106,14 +106,7 @@ class _TaskNetwork(nn.Module):
     @nn.compact
     def __call__(self, observation: jax.Array) -> Any:
         c, end = self.options, self.options * NUM_FEATURES
-        shape = (*observation.shape[:-1], c, NUM_FEATURES)
-        index = jnp.arange(c)
-        return Correction(self.width)(
-            Shortlist(
-                index=index,
-                designs=index,
-                features=observation[..., :end].reshape(shape),
-                log_score=observation[..., end : end + c],
-                valid=observation[..., end + c :] > 0.5,
-            )
-        )
+        features = observation[..., :end].reshape(*observation.shape[:-1], c, -1)
+        log_score, valid = jnp.split(observation[..., end:], 2, axis=-1)
+        seen = Shortlist(None, None, features, log_score, valid > 0.5)
+        return Correction(self.width)(seen)

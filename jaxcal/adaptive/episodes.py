@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 
 from jaxcal.adaptive.session import Decider, SequentialTask, jit_by_class
+from jaxcal.checks import Array
 
 
 @struct.dataclass
@@ -33,19 +34,25 @@ class Episodes:
         return (self.gains * self.alive).sum(axis=-1)
 
 
-def play(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes:
-    """Play one session per key (B,), at most ``task.batch`` at once if it is defined.
+def play(
+    task: SequentialTask,
+    decider: Decider,
+    keys: jax.Array,
+    batch: int = 2**31,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Episodes:
+    """Play one session per key (B,), at most ``batch`` and ``task.batch`` at once.
 
     The truth, the budget and the noise of every measurement depend on the key alone, so
     deciders that are given the same keys can be compared in pairs.
     """
     count = len(keys)
-    size = min(getattr(task, "batch", count), count)
+    size = min(getattr(task, "batch", count), batch, count)
     padded = keys[jnp.arange(-(-count // size) * size) % count]
-    parts = [
-        _played(task, decider, padded[at : at + size])
-        for at in range(0, len(padded), size)
-    ]
+    parts = []
+    for at in range(0, len(padded), size):
+        progress(at)
+        parts.append(_played(task, decider, padded[at : at + size]))
     if len(parts) == 1:
         return parts[0]
     whole: Episodes = jax.tree.map(
@@ -123,10 +130,10 @@ class Comparison:
     """Deciders on the same sessions: information in nats, with standard errors."""
 
     names: tuple[str, ...]
-    gain: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) sum of expected gains
-    entropy_drop: np.ndarray[Any, np.dtype[np.float64]]  # (D, B)
-    log_ratio: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) at the truth
-    choices: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) measurements made
+    gain: Array  # (D, B) sum of expected gains
+    entropy_drop: Array  # (D, B)
+    log_ratio: Array  # (D, B) at the truth
+    choices: Array  # (D, B) measurements made
 
     def mean(self, name: str) -> tuple[float, float]:
         """Nats by the sum of expected gains, and the standard error."""
@@ -158,15 +165,10 @@ def compare(
     keys = jax.random.split(jax.random.key(seed), episodes)
     measured = []
     for decider in deciders.values():
-        parts = []
-        for at in range(0, episodes, batch):
-            progress(at)
-            played = play(task, decider, keys[at : at + batch])
-            choices = played.alive.sum(axis=1)
-            part = played.gain, played.entropy_drop, played.log_ratio, choices
-            parts.append([np.asarray(values, np.float64) for values in part])
-        measured.append([np.concatenate(values) for values in zip(*parts, strict=True)])
-    whole = (np.stack(values) for values in zip(*measured, strict=True))
+        played = play(task, decider, keys, batch, progress)
+        choices = played.alive.sum(axis=1)
+        measured.append((played.gain, played.entropy_drop, played.log_ratio, choices))
+    whole = (np.stack(v).astype(np.float64) for v in zip(*measured, strict=True))
     return Comparison(tuple(deciders), *whole)
 
 

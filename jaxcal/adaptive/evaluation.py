@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.adaptive.episodes import compare
-from jaxcal.adaptive.fit_ahead import fit, outside
+from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.policy import training as policies
@@ -74,23 +74,16 @@ class DeciderEvaluation(Evaluation):
     options: Mapping[str, Any]
     results: tuple[DeciderResult, ...]
     rival: str  # the method that the others are compared with in pairs
-    rules: Mapping[str, Rule]
-    outside: tuple[str, ...]  # sizes beyond those that ``ahead`` was measured on
-
-    def __getitem__(self, method: str) -> DeciderResult:
-        """The result of a method."""
-        return next(result for result in self.results if result.method == method)
+    rules: Mapping[str, Any]
 
     def summarise(self) -> Summary:
         """What table, page and JSON show."""
         shown = ", ".join(f"{name} = {value}" for name, value in self.options.items())
-        beyond = "; ".join(self.outside)
         sessions, rival = len(self.reference), self.rival
         return Summary(
             "",
             f"{self.task}{f' ({shown})' if shown else ''}, seed {self.seed}: "
-            f"{sessions:,} sessions, information gained in "
-            f"nats{f'; ahead is untested for this: {beyond}' if beyond else ''}",
+            f"{sessions:,} sessions, information gained in nats",
             (
                 ("method", lambda row: row.method),
                 ("nats", lambda row: _interval(row.numbers["nats"], "")),
@@ -129,8 +122,7 @@ class DeciderEvaluation(Evaluation):
             },
         }
         if result.method in self.rules:
-            rule: Any = self.rules[result.method]
-            constants = dataclasses.asdict(rule)
+            constants = dataclasses.asdict(self.rules[result.method])
             numbers["constants"] = {name: float(x) for name, x in constants.items()}
         return numbers
 
@@ -178,8 +170,13 @@ def evaluate(
             raise ValueError(f"methods must be of {', '.join(METHODS)}, got {method!r}")
     task = jax.tree.map(jnp.asarray, entry.make(**options))
     trained = policies.load(checkpoint) if "policy" in methods else None
-    needed = [m for m in ("priced", "state") if m in methods]
-    rules = _rules(entry, task, needed, retune, seed, progress)
+    rules: dict[str, Any] = {}
+    for rule, start in {"priced": Priced(), "state": StateRule()}.items():
+        if rule in methods:
+            rules[rule] = entry.rules.get(rule, start)
+            if retune or rule not in entry.rules:
+                tell = functools.partial(progress, f"tuning {rule}")
+                rules[rule] = _tuned(task, rules[rule], seed + 1, tell)
     deciders: dict[str, Any] = {
         "random": Random(), "gain": Gain(), "rate": GainRate(), "shares": SHARES,
         "ahead": AHEAD, **rules,
@@ -188,7 +185,7 @@ def evaluate(
         deciders["policy"] = trained.decider
     if "ahead" in methods and isinstance(task, GridTask):
         progress("fitting ahead", 0, 1)  # on other sessions than judge it
-        deciders["ahead"] = fit(task, seed=seed + 1).decider
+        deciders["ahead"] = fit(task, seed=seed + 1)
     results = []
     for method in methods:
         decider = jax.tree.map(jnp.asarray, deciders[method])
@@ -219,37 +216,20 @@ def evaluate(
         reference=results[methods.index(rival)].values[:, 0],
         rival=rival,
         rules=rules,
-        outside=outside(task) if "ahead" in methods else (),
     )
 
 
-def _rules(
-    entry: Entry,
-    task: Any,
-    needed: Sequence[str],
-    retune: bool,
-    seed: int,
-    progress: Progress,
-) -> dict[str, Rule]:
-    """Priced rules: as they ship with the task, or tuned on it now."""
-    rules = {}
-    for name in needed:
-        rule = entry.rules.get(name)
-        if rule is None or retune:
-            start = {"priced": Priced(), "state": StateRule()}[name]
-            tell = functools.partial(progress, f"tuning {name}")
-            tell(0, _GENERATIONS)
-            # Sessions of another seed than those that judge it.
-            rule = tune(
-                task,
-                start if rule is None else rule,
-                episodes=1024,
-                generations=_GENERATIONS,
-                seed=seed + 1,
-                report=lambda number, *_, tell=tell: tell(number, _GENERATIONS),
-            )
-        rules[name] = rule
-    return rules
+def _tuned(task: Any, rule: Rule, seed: int, tell: Callable[[int, int], None]) -> Rule:
+    """Tuned on sessions of another seed than those that judge it."""
+    tell(0, _GENERATIONS)
+    return tune(
+        task,
+        rule,
+        episodes=1024,
+        generations=_GENERATIONS,
+        seed=seed,
+        report=lambda number, *_: tell(number, _GENERATIONS),
+    )
 
 
 @jit_by_class

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 from typing import Any
 
 import jax
@@ -38,46 +37,15 @@ _MOST, _LEAST = 512, 16  # sessions of one estimate
 _OF_ALL, _POWER = 8.0, 0.25  # pseudo-counts of the mean share; hint = (A share)^.25
 _HASTE = 0.3  # start of its search where time is not limited
 
-_MEASURED = {
-    "states": 1024, "designs": 48, "outcomes": 4, "uses": 5, "measurements": 32,
-    "groups": 4,
-}  # fmt: skip
-
-
-@dataclasses.dataclass(frozen=True)
-class AheadFit:
-    """A decider for one task, and its information gain there."""
-
-    decider: Ahead | Shares
-    nats: float  # per session
-    more: float  # nats per session above ``SHARES``
-    error: float  # standard error of ``more``
-
-
-def outside(task: Any) -> tuple[str, ...]:
-    """Sizes of a task that exceed those on which ``ahead`` was measured, in words."""
-    if not isinstance(task, GridTask):
-        return ("its unknowns are continuous, so ahead decides like shares",)
-    designs, outcomes, states = task.likelihood.shape
-    sizes = {
-        "states": states, "designs": designs, "outcomes": outcomes,
-        "uses": int(np.max(task.num_uses)) * bool((np.asarray(task.uses) > 0).any()),
-        "measurements": task.horizon, "groups": task.num_groups,
-    }  # fmt: skip
-    return tuple(
-        f"{size:,} {name}, tested up to {_MEASURED[name]:,}"
-        for name, size in sizes.items()
-        if size > _MEASURED[name]
-    )
-
 
 def fit(
     task: GridTask,
     seconds: float | None = None,
     uses: int | None = None,
     seed: int = 0,
-) -> AheadFit:
-    """``ahead`` with the constants that gain most on a task's own sessions.
+) -> Ahead | Shares:
+    """``ahead`` with the constants that gain most on a task's own sessions, or
+    ``SHARES`` where the tree loses against it.
 
     Args:
         task: what is measured; every design allowed.
@@ -112,8 +80,7 @@ class _Task:
         chosen = np.full((count, horizon), -1, np.int32)
         tree(
             task.likelihood, task.travel, task.extra, task.uses, task.place_after,
-            *task.limits, np.ones(len(task.likelihood)), *decider.constants(), horizon,
-            decider.effort,
+            *task.limits, *decider.constants(), horizon, decider.effort,
         ).play(
             np.array(task.prior, np.float32), int(task.place),
             (low + spread * rng.permutation(at)).astype(np.float32),
@@ -125,14 +92,13 @@ class _Task:
 
 
 @functools.lru_cache(maxsize=16)
-def _fit(of: _Task, seed: int) -> AheadFit:
+def _fit(of: _Task, seed: int) -> Ahead | Shares:
     seeds = np.random.SeedSequence(seed).generate_state(4)
-    chosen = of.play(_plain(SHARES), _LEAST, seeds[0])[1]
+    plain = Ahead(SHARES, effort=0.0)  # the rule without a tree
+    chosen = of.play(plain, _LEAST, seeds[0])[1]
     length = max(float((chosen >= 0).sum()) / _LEAST, 1.0)
     designs, outcomes, states = of.task.likelihood.shape
-    choice_work = (
-        designs * outcomes * (states + SUM) + NODE
-    )  # of a choice of ``shares``
+    choice_work = designs * outcomes * (states + SUM) + NODE  # by ``shares``
 
     def sessions(work: float, choice: float) -> int:
         return int(min(work / (length * choice), _MOST))
@@ -145,35 +111,24 @@ def _fit(of: _Task, seed: int) -> AheadFit:
             search(
                 start, 8, 12, 4, seeds[1], spread=0.5,
                 nats_of=lambda rule, number: float(
-                    of.play(_plain(rule), count, seeds[1] + number)[0].sum()
+                    of.play(Ahead(rule, effort=0.0), count, seeds[1] + number)[0].sum()
                 ),
             )
         )  # fmt: skip
-    tried = [Ahead(base) for base in bases]
+    hinted: list[tuple[Shares, Any]] = [(base, None) for base in bases]
     if (count := sessions(_PLAY, max(_DEEP, choice_work))) >= _LEAST // 2:
-        tried += [
-            Ahead(base, hints=_hints(of.play(deep, count, seeds[2])[1], designs))
-            for base in bases
-            if (deep := Ahead(base, effort=_DEEP))
-        ]
-    tried = [
-        one.replace(doubt=doubt)  # type: ignore[attr-defined]  # flax
-        for one, doubt in itertools.product(tried, (AHEAD.doubt, 1.0))
-    ]
+        for base in bases:
+            deep = of.play(Ahead(base, effort=_DEEP), count, seeds[2])[1]
+            hinted.append((base, _hints(deep, designs)))
+    doubts = AHEAD.doubt, 1.0
+    tried = [Ahead(base, doubt, h) for base, h in hinted for doubt in doubts]
     count = max(sessions(_TRY, max(AHEAD.effort, choice_work)), _LEAST)
     nats = np.array([of.play(one, count, seeds[3])[0].sum(axis=1) for one in tried])
     mean, error = _paired(nats - nats[0])
     best = int((mean - error).argmax())
-    rule = of.play(_plain(SHARES), count, seeds[3])[0].sum(axis=1)
+    rule = of.play(plain, count, seeds[3])[0].sum(axis=1)
     more, error = _paired(nats[best] - rule)
-    if more < -2.0 * error:
-        return AheadFit(SHARES, float(rule.mean()), 0.0, 0.0)
-    return AheadFit(tried[best], float(nats[best].mean()), float(more), float(error))
-
-
-def _plain(rule: Shares) -> Ahead:
-    """The rule without a tree."""
-    return Ahead(rule, effort=0.0)
+    return SHARES if more < -2.0 * error else tried[best]
 
 
 def _hints(chosen: Any, designs: int) -> Array:

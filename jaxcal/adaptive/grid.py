@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -146,12 +146,11 @@ class GridTask:
     def make(
         theta: ArrayLike,
         designs: ArrayLike,
-        likelihood: ArrayLike | Callable[[Array, Array], ArrayLike],
+        likelihood: ArrayLike,
         *,
         prior: ArrayLike | None = None,
         travel: ArrayLike = 0.0,
         place_after: ArrayLike | None = None,
-        place: int | None = None,
         groups: ArrayLike | None = None,
         extra: ArrayLike = 0.0,
         uses: ArrayLike = 0,
@@ -166,14 +165,13 @@ class GridTask:
         Args:
             theta: (S, d) or (S,) values that the unknown may have.
             designs: (A, e) or (A,) what may be measured.
-            likelihood: (A, Y, S) probability of each outcome, or a function of
-                ``designs`` (A, e) and ``theta`` (S, d) that returns it.
+            likelihood: (A, Y, S) probability of each outcome.
             prior: (S,) weights; equal when not given.
             travel: seconds from a place to a measured design: a number, (A,) or
                 (P, A). Places 0 to A - 1 are the designs, others are the task's own.
-                Where it is not (P, A), a place A is added, where a session starts.
+                Where it is not (P, A), a place A is added. A session starts at the
+                last place.
             place_after: (A, Y) place after an outcome; the design itself by default.
-            place: at the start; the last place by default.
             groups: (A,) group of each design from 0, such as its joint; a shortlist
                 holds the best of each group. One group by default.
             extra: (A, Y), or what broadcasts to it, seconds that an outcome costs.
@@ -192,7 +190,7 @@ class GridTask:
         table = checked.probabilities(likelihood, at, grid)
         weights, possible = checked.weights(prior, table)
         shape, lengths = table.shape[:2], checked.grid(grid)
-        times, after, first = checked.places(travel, place_after, place, shape)
+        times, after = checked.places(travel, place_after, shape)
         more = checked.costs("extra", extra, shape)
         used = checked.costs("uses", uses, shape)
         group = checked.groups(groups, len(at))
@@ -212,7 +210,7 @@ class GridTask:
             most_uses=checked.whole(np.where(possible, used, 0.0).max(axis=1)),
             seconds=checked.single(checked.seconds(seconds)),
             num_uses=checked.whole(checked.ends(num_uses)),
-            place=checked.whole(first),
+            place=checked.whole(len(times) - 1),
             groups=checked.whole(group),
             num_groups=int(group.max()) + 1,
             shape=lengths,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -11,12 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import Array, in_words, numbers
 
 
-def probabilities(
-    likelihood: ArrayLike | Callable[[Array, Array], ArrayLike], at: Array, grid: Array
-) -> Array:
+def probabilities(likelihood: ArrayLike, at: Array, grid: Array) -> Array:
     """(A, Y, S) probabilities that sum to 1 over the outcomes."""
-    values = likelihood(at, grid) if callable(likelihood) else likelihood
-    table = numbers("likelihood", values)
+    table = numbers("likelihood", likelihood)
     if table.ndim != 3 or table.shape[::2] != (len(at), len(grid)):
         raise ValueError(
             f"likelihood must have shape ({len(at)}, Y, {len(grid)}), got {table.shape}"
@@ -47,12 +44,9 @@ def weights(prior: ArrayLike | None, table: Array) -> tuple[Array, NDArray[np.bo
 
 
 def places(
-    travel: ArrayLike,
-    place_after: ArrayLike | None,
-    place: int | None,
-    shape: tuple[int, int],
-) -> tuple[Array, Array, int]:
-    """(P, A) seconds of travel, (A, Y) places after outcomes, and the first place."""
+    travel: ArrayLike, place_after: ArrayLike | None, shape: tuple[int, int]
+) -> tuple[Array, Array]:
+    """(P, A) seconds of travel, and (A, Y) places after outcomes."""
     times, count = numbers("travel", travel), shape[0]
     if times.ndim < 2:
         times = np.broadcast_to(times, (count + 1, count))
@@ -64,20 +58,24 @@ def places(
     _require_not_negative("travel", times)
     if place_after is None:
         place_after = np.arange(count)[:, None]  # the design itself
-    after = _table("place_after", place_after, shape)
-    first = len(times) - 1 if place is None else place
-    for name, values in (("place_after", after), ("place", np.asarray(first))):
-        if (values % 1 != 0).any() or values.min() < 0 or values.max() >= len(times):
-            raise ValueError(
-                f"{name} must hold places in [0, {len(times)}), "
-                f"got {values.min():g} to {values.max():g}"
-            )
-    return times, after, first
+    after = costs("place_after", place_after, shape)
+    if (after % 1 != 0).any() or after.max() >= len(times):
+        raise ValueError(
+            f"place_after must hold places in [0, {len(times)}), "
+            f"got {after.min():g} to {after.max():g}"
+        )
+    return times, after
 
 
 def costs(name: str, values: ArrayLike, shape: tuple[int, int]) -> Array:
-    """(A, Y) costs of outcomes, at least 0."""
-    table = _table(name, values, shape)
+    """(A, Y) numbers of outcomes, at least 0."""
+    array = numbers(name, values)
+    try:
+        table = np.broadcast_to(array, shape)
+    except ValueError:
+        raise ValueError(
+            f"{name} must broadcast to {shape}, got shape {array.shape}"
+        ) from None
     _require_not_negative(name, table)
     return table
 
@@ -145,18 +143,7 @@ def columns(name: str, values: ArrayLike) -> Array:
     return array
 
 
-def _table(name: str, values: ArrayLike, shape: tuple[int, int]) -> Array:
-    array = numbers(name, values)
-    try:
-        return np.broadcast_to(array, shape)
-    except ValueError:
-        raise ValueError(
-            f"{name} must broadcast to {shape}, got shape {array.shape}"
-        ) from None
-
-
 def names(given: Sequence[str], count: int) -> tuple[str, ...]:
-    """Names of the unknowns."""
     names = tuple(given) or tuple(f"theta{i + 1}" for i in range(count))
     if len(names) != count:
         raise ValueError(f"theta_names must hold {count} names, got {names}")

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.particles import ParticleBelief, outcome_shape
 from jaxcal.adaptive.session import SequentialTask, Session, jit_by_class
-from jaxcal.checks import array_of, in_words, numbers, whole_number
+from jaxcal.checks import array_of, in_words, whole_number
 from jaxcal.checks import seconds as checked_seconds
-
-History = Iterable[tuple[Any, Any]]  # (design, outcome) of each measurement, in order
-
-_NEAR = 1e-5  # of a coordinate's range: tolerance for coordinates of a design
 
 
 def begin(
@@ -33,7 +27,7 @@ def begin(
     belief, session = task.begin(jax.random.key(seed))
     if isinstance(task, GridTask):
         low, high = np.asarray(task.seconds)
-        ends = np.asarray(task.num_uses)
+        ends = np.asarray(task.num_uses, float)
         if seconds is None and low < high:
             raise ValueError(
                 f"seconds is missing: the task draws its budget from {low:g} to "
@@ -41,76 +35,51 @@ def begin(
             )
         if uses is None and len(ends) > 1:
             raise ValueError(
-                "uses is missing: the task draws its budget from "
-                f"{in_words(ends.astype(float))}"
+                f"uses is missing: the task draws its budget from {in_words(ends)}"
             )
+    budget = {}
     if seconds is not None:
-        budget = jnp.float32(checked_seconds("seconds", seconds))
-        session = session.replace(seconds=budget)  # type: ignore[attr-defined]  # flax
+        budget["seconds"] = jnp.float32(checked_seconds("seconds", seconds))
     if uses is not None:
-        budget = jnp.int32(whole_number("uses", uses, 1))
-        session = session.replace(uses=budget)  # type: ignore[attr-defined]  # flax
-    return belief, session
+        budget["uses"] = jnp.int32(whole_number("uses", uses, 1))
+    return belief, session.replace(**budget)  # type: ignore[attr-defined]  # flax
 
 
-class StepKeys(NamedTuple):
-    """PRNG keys of one measurement."""
-
-    options: jax.Array
-    choice: jax.Array
-    update: jax.Array  # of the belief
-    gain: jax.Array  # of the gain of the chosen design, independent of ``choice``
-
-
-def step_keys(seed: int, number: int) -> StepKeys:
-    """Keys of measurement ``number``, from 0.
+def step_keys(seed: int, number: int) -> jax.Array:
+    """(4,) keys of measurement ``number``, from 0: of its options, the choice, the
+    belief's update, and the gain that is told, which no choice was made by.
 
     They depend on seed and number alone: a resumed session goes on as uninterrupted.
     """
-    key = jax.random.fold_in(jax.random.key(seed), number)
-    return StepKeys(*jax.random.split(key, 4))
-
-
-class State(Protocol):
-    """A session and what is known in it; a ``Loop``."""
-
-    task: SequentialTask
-    belief: Any
-    session: Session
+    return jax.random.split(jax.random.fold_in(jax.random.key(seed), number), 4)
 
 
 def checked_entry(
-    state: State, design: Any, outcome: Any, where: str
-) -> tuple[Any, Any]:
+    loop: Any, design: Any, outcome: Any, where: str
+) -> tuple[Any, jax.Array]:
     """Design and outcome as the task has them, of a measurement that can be paid.
 
-    A task with a table ``designs`` (A, e) takes a whole number as an index of it and
-    anything else as coordinates; other tasks take designs as their options have them.
+    A design is an index where the task has a table ``designs``; other tasks take
+    designs as their options have them.
 
     Raises:
         ValueError: naming the entry, the rule and the value.
     """
-    table = getattr(state.task, "designs", None)
+    table = getattr(loop.task, "designs", None)
     if table is not None:
-        index = _index(np.asarray(table, np.float64), design, f"{where}: design")
-        design = jnp.int32(index)
+        design = _index(f"{where}: design", design, len(table))
     else:
-        design = _as_designs(state, design, f"{where}: design")
-    of_kind = _of_table if isinstance(state.task, GridTask) else _of_particles
-    return design, of_kind(state, design, outcome, where)
+        design = _as_options(loop, design, f"{where}: design")
+    of_kind = _of_table if isinstance(loop.task, GridTask) else _of_particles
+    return design, of_kind(loop, design, outcome, where)
 
 
-def _of_table(state: Any, design: jax.Array, outcome: Any, where: str) -> jax.Array:
+def _of_table(loop: Any, design: jax.Array, outcome: Any, where: str) -> jax.Array:
     """Outcome of a design of a table, which the budget must have paid."""
-    task, session = state.task, state.session
-    count = task.likelihood.shape[1]
-    index = _whole(outcome)
-    if index is None or not 0 <= index < count:
-        raise ValueError(
-            f"{where}: outcome must be a whole number in [0, {count}), got {outcome!r}"
-        )
+    task, session = loop.task, loop.session
+    index = _index(f"{where}: outcome", outcome, task.likelihood.shape[1])
     likelihood = np.asarray(task.likelihood[design, index], np.float64)
-    if not (likelihood * np.asarray(state.belief.weights, np.float64)).sum() > 0.0:
+    if not (likelihood * np.asarray(loop.belief.weights, np.float64)).sum() > 0.0:
         raise ValueError(
             f"{where}: outcome {index} of design "
             f"{in_words(np.asarray(task.designs[design], np.float64))} is impossible "
@@ -123,14 +92,13 @@ def _of_table(state: Any, design: jax.Array, outcome: Any, where: str) -> jax.Ar
             f"{int(task.most_uses[design])} uses: {what_is_left(session)}; tasks with "
             "overrun=True may exceed the budget"
         )
-    return jnp.int32(index)
+    return index
 
 
-def _of_particles(state: State, design: Any, outcome: Any, where: str) -> jax.Array:
-    belief = state.belief
+def _of_particles(loop: Any, design: Any, outcome: Any, where: str) -> jax.Array:
+    belief, support = loop.belief, loop.belief.model.support
     values = array_of(f"{where}: outcome", outcome, *outcome_shape(belief.model))
     answer = jnp.asarray(values, jnp.float32)
-    support = belief.model.support
     if support is not None and not (answer == support).any():
         raise ValueError(
             f"{where}: outcome must be one of the {len(support)} of model.support, "
@@ -163,67 +131,45 @@ def after(
 _can_answer = jit_by_class(ParticleBelief.can_answer)
 
 
-def _as_designs(state: State, design: Any, where: str) -> Any:
+def _as_options(loop: Any, design: Any, where: str) -> Any:
     """A design in the structure, the shapes and the types of the task's options."""
 
     def typed(leaf: Any, values: Any) -> jax.Array:
         return jnp.asarray(array_of(where, values, *leaf.shape[1:]), leaf.dtype)
 
-    like = _like(state)
+    like = _like(loop)
+    structure: Any = jax.tree.structure(like)
     try:
-        jax.tree.structure(like).flatten_up_to(design)  # type: ignore[attr-defined]  # jaxlib
+        structure.flatten_up_to(design)
     except ValueError:
         raise ValueError(
-            f"{where} must have the structure {jax.tree.structure(like)}, got "
-            f"{design!r}"
+            f"{where} must have the structure {structure}, got {design!r}"
         ) from None
     return jax.tree.map(typed, like, design)
 
 
-def from_leaves(state: State, leaves: list[Any]) -> Any:
+def from_leaves(loop: Any, leaves: list[Any]) -> Any:
     """A design from the list of its leaves, as a journal has it."""
-    return jax.tree.unflatten(jax.tree.structure(_like(state)), leaves)
+    return jax.tree.unflatten(jax.tree.structure(_like(loop)), leaves)
 
 
-def _like(state: State) -> Any:
+def _like(loop: Any) -> Any:
     """Shapes and types of the task's options, leaves (A, ...)."""
-    now = state.belief, state.session, jax.random.key(0)
-    return jax.eval_shape(state.task.options, *now).designs
+    now = loop.belief, loop.session, jax.random.key(0)
+    return jax.eval_shape(loop.task.options, *now).designs
 
 
-def _index(table: NDArray[np.float64], design: Any, where: str) -> int:
-    """The row of ``table`` (A, e) that a whole number or coordinates name."""
-    index = _whole(design)
-    if index is not None:
-        if not 0 <= index < len(table):
-            raise ValueError(f"{where} must lie in [0, {len(table)}), got {index}")
-        return index
-    coordinates = np.atleast_1d(numbers(where, design))
-    if coordinates.shape != table.shape[1:]:
-        raise ValueError(
-            f"{where} must be an index or have {table.shape[1]} coordinates, "
-            f"got {design!r}"
-        )
-    span = np.ptp(table, axis=0)
-    off = np.abs(table - coordinates) / np.where(
-        span > 0.0, span, np.abs(table).max() or 1.0
-    )
-    nearest = int(off.max(axis=1).argmin())
-    if off[nearest].max() > _NEAR:
-        raise ValueError(
-            f"{where} must be a design of the task, got {in_words(coordinates)}; the "
-            f"nearest is {nearest}, {in_words(table[nearest])}"
-        )
-    return nearest
-
-
-def _whole(value: Any) -> int | None:
-    if isinstance(value, bool | np.bool_):
-        return None
+def _index(name: str, value: Any, count: int) -> jax.Array:
+    """() int32 of a whole number in [0, count)."""
     try:
-        return operator.index(value)
+        index = -1 if isinstance(value, bool | np.bool_) else operator.index(value)
     except TypeError:
-        return None
+        index = -1
+    if not 0 <= index < count:
+        raise ValueError(
+            f"{name} must be a whole number in [0, {count}), got {value!r}"
+        )
+    return jnp.int32(index)
 
 
 def what_is_left(session: Session) -> str:

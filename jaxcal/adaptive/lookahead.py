@@ -22,7 +22,7 @@ class Ahead:
 
     The measurement of the largest expected total of nats: exact where the session ends
     within the tree, with an estimate of what follows elsewhere; deterministic. It is
-    ``shares`` on a task that is not a ``GridTask``, and where even a small tree takes
+    ``shares`` on any class but ``GridTask`` itself, and where even a small tree takes
     more than ``effort`` multiplications per choice (7e5: about .04 ms of one core).
     """
 
@@ -34,15 +34,14 @@ class Ahead:
     def __call__(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
     ) -> jax.Array:
-        if not isinstance(task, GridTask):
+        if type(task) is not GridTask:  # one of its own may not allow every design
             return self.base(task, belief, session, options, key)
         constants, hints = self.constants()
         return on_host(
             functools.partial(_chosen, task.horizon, self.effort),
             jax.ShapeDtypeStruct((), jnp.int32),
             *(task.likelihood, task.travel, task.extra, task.uses, task.place_after),
-            *(*task.limits, _possible(task, session, options)),
-            *(jnp.stack(constants), hints, belief.weights),
+            *(*task.limits, jnp.stack(constants), hints, belief.weights),
             *(session.place, session.seconds, session.uses, session.made),
         )
 
@@ -53,73 +52,48 @@ class Ahead:
         return numbers, np.ones((1, 1)) if self.hints is None else self.hints
 
 
-def _possible(task: GridTask, session: Session, options: Options) -> jax.Array:
-    """(A,) bool: designs that may be measured where they can be paid.
-
-    What can be paid the tree finds. One tree serves all sessions of a batch unless a
-    task of another kind decides by the session.
-    """
-    if type(task).options is GridTask.options:
-        return jnp.ones(len(task.designs), bool)
-    return options.allowed | ~task.payable(session)
-
-
 AHEAD = Ahead()
 
-_TABLES = 10  # arrays of the task come first, then those of the session
-_DIMENSIONS = (3, 2, 2, 2, 2, 1, 1, 1, 1, 2, 1, 0, 0, 0, 0)
+# Dimensions of the task's arrays, which come first.
+_TABLES = (3, 2, 2, 2, 2, 1, 1, 1, 2)
 
 
 def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
-    """(...) int32 choices; arrays have leading batch axes that broadcast."""
-    inputs = [np.asarray(array) for array in arrays]
-    sized = list(zip(inputs, _DIMENSIONS, strict=True))
-    batches = [array.shape[: array.ndim - dims] for array, dims in sized]
-    batch = np.broadcast_shapes(*batches)
-    tasks = np.broadcast_shapes(*batches[:_TABLES])
-    states = [
-        np.broadcast_to(array, batch + array.shape[array.ndim - dims :])
-        for array, dims in sized[_TABLES:]
-    ]
-    chosen = np.empty(batch, np.int32)
-    for index in np.ndindex(tasks):  # one iteration per task
-        tables = [
-            array[
-                tuple(min(i, n - 1) for i, n in zip(index, array.shape, strict=False))
-            ]
-            for array in inputs[:_TABLES]
-        ]
-        searched = tree(*[*tables, horizon, effort])
-        at = tuple(
-            slice(None) if n == 1 else i for i, n in zip(index, tasks, strict=True)
-        )
-        belief, place, seconds, uses, made = (state[at] for state in states)
-        designs = np.empty(place.size, np.int32)
-        searched.choose(
-            _single(belief).reshape(designs.size, -1), _whole(place),
-            _single(seconds).ravel(), _whole(uses), _whole(made), designs,
-        )  # fmt: skip
-        chosen[at] = designs.reshape(place.shape)
-    return chosen
+    """(...) int32 choices in sessions of one task; (...) are axes of ``vmap``."""
+    tables: list[Any] = []
+    for array, dims in zip(arrays, _TABLES, strict=False):
+        if np.prod(array.shape[: array.ndim - dims]) > 1:
+            raise ValueError("Ahead decides for one task at a time, got several")
+        tables.append(np.reshape(array, array.shape[array.ndim - dims :]))
+    belief, *session = map(np.asarray, arrays[len(_TABLES) :])
+    batch = np.broadcast_shapes(belief.shape[:-1], *(leaf.shape for leaf in session))
+    states = belief.shape[-1]
+    beliefs = np.broadcast_to(belief, (*batch, states)).reshape(-1, states)
+    kinds = np.int32, np.float32, np.int32, np.int32  # place, seconds, uses, made
+    place, seconds, uses, made = (
+        np.broadcast_to(leaf, batch).astype(kind).ravel()
+        for leaf, kind in zip(session, kinds, strict=True)
+    )
+    chosen = np.empty(len(beliefs), np.int32)
+    searched = tree(*[*tables, horizon, effort])
+    searched.choose(_single(beliefs), place, seconds, uses, made, chosen)
+    return chosen.reshape(batch)
 
 
 def tree(
     likelihood: Any, travel: Any, extra: Any, uses: Any, place_after: Any,
-    most_extra: Any, most_uses: Any, allowed: Any, constants: Any, hints: Any,
+    most_extra: Any, most_uses: Any, constants: Any, hints: Any,
     horizon: int, effort: float,
 ) -> Tree:  # fmt: skip
     """The kernel's object from tables as ``GridTask`` and its ``limits`` have them."""
+    hints = np.broadcast_to(hints, (len(hints), len(likelihood)))
     return Tree(
         _single(likelihood), _single(travel), _single(np.transpose(extra)),
         _single(np.transpose(uses)), np.array(place_after, np.int32),
-        _single(most_extra), _single(most_uses), _single(allowed),
-        horizon, constants, _single(hints), effort,
+        _single(most_extra), _single(most_uses), horizon, constants, _single(hints),
+        effort,
     )  # fmt: skip
 
 
 def _single(array: Any) -> Any:
     return np.array(array, np.float32, order="C")  # JAX's cannot be written
-
-
-def _whole(array: Any) -> Any:
-    return np.array(array, np.int32).ravel()

@@ -5,17 +5,15 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxcal.adaptive.fit_ahead import fit, outside
+from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.history import (
-    History,
-    StepKeys,
     after,
     begin,
     checked_entry,
@@ -23,9 +21,8 @@ from jaxcal.adaptive.history import (
     step_keys,
     what_is_left,
 )
-from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.particles import ParticleBelief
-from jaxcal.adaptive.rules import Gain
+from jaxcal.adaptive.rules import SHARES, Gain
 from jaxcal.adaptive.session import (
     Decider,
     SequentialTask,
@@ -35,6 +32,8 @@ from jaxcal.adaptive.session import (
 )
 from jaxcal.checks import Array
 from jaxcal.jsonlines import JsonLines, Record
+
+History = Iterable[tuple[Any, Any]]  # (design, outcome) of each measurement, in order
 
 _KIND = "jaxcal adaptive session"  # of a journal
 _DRAWS = 32  # of the gain that is told, which a single one leaves uncertain by a third
@@ -52,7 +51,6 @@ class Proposal:
     number: int  # measurements made before it
     belief: Any
     session: Session  # what is left
-    outside: tuple[str, ...]  # ``fit_ahead.outside``; empty where a decider was given
 
 
 def next_measurement(
@@ -69,7 +67,7 @@ def next_measurement(
     Args:
         task: what is unknown and what may be measured.
         history: (design, outcome) of each measurement in order. A design is an index of
-            ``task.designs`` (a whole number) or its coordinates.
+            ``task.designs``, or where the task has no table its coordinates.
         decider: when not given, the largest expected gain; where time or uses count,
             what ``fit_ahead.fit`` finds for the task and this budget, in some seconds
             at the first call.
@@ -91,31 +89,26 @@ def run(
     measure: Callable[[Proposal], Any],
     *,
     journal: str | os.PathLike[str] | None = None,
-    seconds: float | None = None,
-    uses: int | None = None,
-    seed: int = 0,
+    **budget: Any,
 ) -> Loop:
     """Propose, measure, update, until the budget is spent; the loop at its end.
 
     Args:
-        task, decider, seconds, uses, seed: as in ``next_measurement``.
+        task, decider: as in ``next_measurement``.
         measure: makes the measurement and returns its outcome; whatever it raises ends
             the loop, and what was measured before is in the journal.
         journal: file of the session. Where it is there the session goes on as if it had
             not been interrupted.
+        budget: ``seconds``, ``uses`` and ``seed`` of ``next_measurement``.
 
     Raises:
         ValueError: the journal is of another task, decider or budget; an outcome is not
             one of the task's, or cannot follow what was measured before.
     """
-    with Loop(
-        task, decider, journal=journal, seconds=seconds, uses=uses, seed=seed
-    ) as loop:
-        while True:
-            proposal = loop.suggest()
-            if proposal.design is None:
-                return loop
+    with Loop(task, decider, journal=journal, **budget) as loop:
+        while (proposal := loop.suggest()).design is not None:
             loop.observed(measure(proposal))
+        return loop
 
 
 class Loop:
@@ -146,7 +139,6 @@ class Loop:
             "uses": int(self.session.uses),
             "seed": seed,
         }
-        self._outside = outside(task) if decider is None else ()
         self._decider = _default(task, self.session) if decider is None else decider
         self._proposal: Proposal | None = None
         self._journal = None if journal is None else _opened(journal, header)
@@ -163,9 +155,7 @@ class Loop:
         """Take measurements that were made before, which no journal notes.
 
         Raises:
-            ValueError: naming the entry, from 0: a design or an outcome that the task
-                does not have, an outcome that cannot follow what was measured before,
-                or an entry after the budget was spent.
+            ValueError: an entry that cannot be, by its number from 0.
         """
         for number, entry in enumerate(history):
             where = f"history[{number}]"
@@ -187,7 +177,7 @@ class Loop:
                 )
 
     def _advance(self, entry: tuple[Any, Any]) -> None:
-        key = step_keys(self._seed, int(self.session.made)).update
+        key = step_keys(self._seed, int(self.session.made))[2]
         state = self.task, self.belief, self.session
         self.belief, self.session = after(*state, *entry, key)
         self.history.append(entry)
@@ -195,16 +185,13 @@ class Loop:
 
     def suggest(self) -> Proposal:
         """What to measure next; its design is None where the session is over."""
-        if self._proposal is None:
-            self._proposal = self._proposed()
+        self._proposal = self._proposal or self._proposed()
         return self._proposal
 
     def _proposed(self) -> Proposal:
         task, belief, session = self.task, self.belief, self.session
         number = int(session.made)
-        end = Proposal(
-            None, None, 0.0, 0.0, 0.0, number, belief, session, self._outside
-        )
+        end = Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session)
         if bool(task.over(session)):
             return end
         keys = step_keys(self._seed, number)
@@ -215,18 +202,12 @@ class Loop:
             raise ValueError(f"a measurement costs at least 0 s, got {float(took):g}")
         if not payable:
             return end
-        table = getattr(task, "designs", None)
-        design = jax.tree.map(np.asarray, design)
-        coordinates = design if table is None else np.asarray(table[int(design)])
-        design = design if table is None else int(design)
-        return dataclasses.replace(
-            end,
-            design=design,
-            coordinates=coordinates,
-            gain=float(gain),
-            seconds=float(took),
-            uses=float(uses),
-        )
+        coordinates = design = jax.tree.map(np.asarray, design)
+        if (table := getattr(task, "designs", None)) is not None:
+            design = int(design)
+            coordinates = np.asarray(table[design])
+        numbers = float(gain), float(took), float(uses)
+        return Proposal(design, coordinates, *numbers, number, belief, session)
 
     def observed(self, outcome: Any, design: Any = None) -> None:
         """Take an outcome: of what was suggested, or of another design that was made.
@@ -263,9 +244,9 @@ def _default(task: SequentialTask, session: Session) -> Decider:
     counted = isinstance(task, GridTask) and bool((task.uses > 0).any())
     if not (math.isfinite(session.seconds) or counted):
         return Gain()
-    if type(task) is not GridTask:  # a kind of its own may not allow every design
-        return AHEAD
-    return fit(task, float(session.seconds), int(session.uses)).decider
+    if type(task) is not GridTask:
+        return SHARES
+    return fit(task, float(session.seconds), int(session.uses))
 
 
 def _opened(path: str | os.PathLike[str], header: Record) -> JsonLines:
@@ -304,13 +285,14 @@ def _choose(
     decider: Decider,
     belief: Any,
     session: Session,
-    keys: StepKeys,
+    keys: jax.Array,
 ) -> tuple[Any, ...]:
-    options = task.options(belief, session, keys.options)
-    index = decider(task, belief, session, options, keys.choice)
+    key_options, key_choice, _, key_gain = keys
+    options = task.options(belief, session, key_options)
+    index = decider(task, belief, session, options, key_choice)
     seconds, uses = task.expected(belief, session, options)
     design = jax.tree.map(lambda leaf: leaf[index], options.designs)
-    draws = jax.random.split(keys.gain, _DRAWS)
+    draws = jax.random.split(key_gain, _DRAWS)
     gain = jax.vmap(lambda key: belief.gain(task, design, key))(draws).mean()
     return design, gain, seconds[index], uses[index], options.allowed.any()
 

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from jaxcal.adaptive.grid_tables import single
 from jaxcal.adaptive.session import Session, on_host
-from jaxcal.checks import Array, numbers, table
+from jaxcal.checks import Array, numbers, one_or_each, table
 from jaxcal.models.from_jax import FromJax
 from jaxcal.models.function import FromFunction
 from jaxcal.models.model import Model, as_commands, as_model, by_name
@@ -128,21 +128,21 @@ def candidates_of(
     linear = model.multiplicity > 0
     shape = (*at_mean.shape, len(mean))
     slope = derivative(model, commands, mean) if linear else np.zeros((*shape[:2], 0))
-    costs = numbers("cost", seconds)
-    if costs.shape not in ((), (len(commands),)) or (costs < 0.0).any():
-        raise ValueError(
-            f"cost must be a number or ({len(commands)},), at least 0, got shape "
-            f"{costs.shape}, least {costs.min():g}"
-        )
+    costs = one_or_each("cost", numbers("cost", seconds), len(commands))
+    if (costs < 0.0).any():
+        raise ValueError(f"cost must be at least 0, got {costs.min():g}")
+    outputs: Callable[..., jax.Array] | None = None
+    if not linear:
+        is_jax = isinstance(model, FromJax)
+        outputs = _JaxReadings(model.f) if is_jax else _HostReadings(model, commands)
     scale = np.linalg.slogdet(white)[1] - shape[1] / 2 * np.log(2.0 * np.pi)
     return Candidates(
         commands=single(commands), mean=single(mean), std=single(std),
         white=single(white), noise=single(np.linalg.inv(white)),
         log_scale=single(scale),
-        seconds=single(np.broadcast_to(costs, len(commands))),
-        at_mean=single(at_mean), slope=single(slope), draw=draw,
+        seconds=single(costs), at_mean=single(at_mean), slope=single(slope), draw=draw,
         periods=None if model.periods is None else single(model.periods),
-        outputs=None if linear else _outputs(model, commands, mean), names=model.names,
+        outputs=outputs, names=model.names,
     )  # fmt: skip
 
 
@@ -197,12 +197,6 @@ def _whitening(
         inputs = tuple(f"u{i + 1}" for i in range(commands.shape[1]))
         by_command = derivative(model, commands, mean, inputs)
     return noise.whitening(shape[0], shape[1], by_command)
-
-
-def _outputs(model: Model, commands: Array, mean: Array) -> Callable[..., jax.Array]:
-    if isinstance(model, FromJax):
-        return _JaxReadings(model.f)
-    return _HostReadings(model, commands)
 
 
 class _JaxReadings:

@@ -84,14 +84,19 @@ def gain_of(
         ratio = jnp.exp(jnp.minimum(all_of - log_prob[:, None], 80.0))
         gain = -jnp.log(ratio.mean(axis=-1)).mean()
     else:
-        log_p = jax.vmap(
-            lambda p: jax.vmap(lambda y: model.log_prob(p, y))(model.support)
-        )(predictions)  # (n, Y)
+        log_p = log_prob_of_all(model, predictions)  # (n, Y)
         p = jnp.exp(log_p)
         within = (p * jnp.maximum(log_p, FLOOR)).sum(axis=-1).mean()
         mixed = p.mean(axis=0)
         gain = within - (mixed * jnp.log(mixed + 1e-30)).sum()
     return jnp.maximum(gain, 0.0)
+
+
+def log_prob_of_all(model: ParticleModel, predictions: Any) -> jax.Array:
+    """(n, Y) log probabilities of the outcomes ``model.support``."""
+    assert model.support is not None
+    by_outcome = jax.vmap(model.log_prob, in_axes=(None, 0))
+    return jax.vmap(by_outcome, in_axes=(0, None))(predictions, model.support)
 
 
 def log_likelihood_of(

@@ -24,6 +24,7 @@ from jaxcal.adaptive.particle_model import (
     gain_of,
     log_likelihood_of,
     log_prior,
+    log_prob_of_all,
     outcome_shape,
     reweighted,
     systematic,
@@ -35,7 +36,6 @@ from jaxcal.models.uncertainty import Noise, Prior
 _ENOUGH = 0.5  # effective share of the particles below which they are moved
 _HALVINGS = 10  # bisections for a temperature
 _STEPS = 40  # temperatures that one outcome may take
-_FEW = 8  # outcomes per design that a two-step look-ahead follows
 _AT_ONCE = 2**25  # log probabilities that sessions played at once may hold
 _DESIGNS = 512  # whose gains are computed at once
 
@@ -67,34 +67,6 @@ class ParticleBelief:
         """(count, d) equally weighted particles."""
         return self.z[systematic(self.log_weight, count, key)]
 
-    def draw(self, key: jax.Array) -> jax.Array:
-        """(d,) coordinates, drawn."""
-        return self.draws(1, key)[0]
-
-    def outcomes(
-        self, task: ParticleTask, design: Any, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """(Y,) outcomes of a design and (Y,) their probabilities.
-
-        All outcomes where they are at most eight; otherwise eight draws.
-        """
-        model, support = self.model, self.model.support
-        if support is not None and len(support) <= _FEW:
-            z, weight = self.z, jnp.exp(self.log_weight)
-        else:
-            key, key_draws = jax.random.split(key)
-            z, weight = self.draws(_FEW, key_draws), jnp.full(_FEW, 1.0 / _FEW)
-        predictions = jax.vmap(
-            lambda z: model.predict(model.unknowns(z), design)
-        )(z)  # fmt: skip
-        if support is None or len(support) > _FEW:
-            keys = jax.random.split(key, _FEW)
-            return jax.vmap(model.sample)(predictions, keys), weight
-        log_p = jax.vmap(
-            lambda p: jax.vmap(lambda y: model.log_prob(p, y))(support)
-        )(predictions)  # fmt: skip
-        return support, weight @ jnp.exp(log_p)
-
     def can_answer(self, design: Any, outcome: jax.Array) -> jax.Array:
         """() bool: some particle gives the outcome a probability above 0."""
         unknowns = jax.vmap(self.model.unknowns)(self.z)
@@ -117,10 +89,10 @@ class ParticleBelief:
         def gain(design: Any) -> jax.Array:
             return gain_of(self.model, unknowns, design, keys)
 
-        if len(options.seconds) > _DESIGNS:
-            of_all: jax.Array = jax.lax.map(gain, options.designs, batch_size=_DESIGNS)
-            return of_all
-        return jax.vmap(gain)(options.designs)
+        if len(options.seconds) <= _DESIGNS:
+            return jax.vmap(gain)(options.designs)
+        of_all: jax.Array = jax.lax.map(gain, options.designs, batch_size=_DESIGNS)
+        return of_all
 
     def gain(self, task: ParticleTask, design: Any, key: jax.Array) -> jax.Array:
         """() nats of one design: ``gains`` of it alone, by draws of its own."""
@@ -149,13 +121,8 @@ class ParticleBelief:
         enough = _ENOUGH * len(self.z)
         whole = effective(self.log_weight + new) >= enough
         log_weight, evidence = reweighted(self.log_weight, jnp.where(whole, new, 0.0))
-        carry = (
-            jnp.where(whole, 1.0, 0.0), jnp.int32(0), self.z, log_weight,
-            self.log_likelihood, new, evidence, key,
-        )  # fmt: skip
-
-        def more(carry: Any) -> jax.Array:
-            return carry[0] < 1.0
+        begun = jnp.where(whole, 1.0, 0.0), jnp.int32(0), self.z, log_weight
+        carry = (*begun, self.log_likelihood, new, evidence, key)
 
         def temper(carry: Any) -> Any:
             power, steps, z, log_weight, old, new, evidence, key = carry
@@ -182,7 +149,7 @@ class ParticleBelief:
             return power, steps + 1, z, log_weight, old, new, evidence + add, key
 
         _, _, z, log_weight, old, new, evidence, _ = jax.lax.while_loop(
-            more, temper, carry
+            lambda carry: carry[0] < 1.0, temper, carry
         )
         return dataclasses.replace(
             observed,
@@ -193,13 +160,7 @@ class ParticleBelief:
         )
 
     def _moved(
-        self,
-        z: jax.Array,
-        old: jax.Array,
-        new: jax.Array,
-        power: jax.Array,
-        key: jax.Array,
-        num_moves: int,
+        self, z: Any, old: Any, new: Any, power: Any, key: jax.Array, num_moves: int
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Metropolis moves along differences of two other particles, of many sizes."""
         count, dim = z.shape
@@ -213,18 +174,13 @@ class ParticleBelief:
             there = z + jnp.exp(size) * (1.2 / dim**0.5) * way
             whole, last = self._history(there), self._last(there)
             before = whole - last
-            change = (
-                log_prior(there) - log_prior(z)
-                + before - old + power * (last - new)
-            )  # fmt: skip
+            change = log_prior(there) - log_prior(z)
+            change = change + before - old + power * (last - new)
             level = jnp.log(jax.random.uniform(key_accept, (count,), minval=1e-30))
             take = level < change
-            kept = (
-                jnp.where(take[:, None], there, z),
-                jnp.where(take, before, old),
-                jnp.where(take, last, new),
-            )
-            return kept, None
+            moved = jnp.where(take[:, None], there, z)
+            likelihoods = jnp.where(take, before, old), jnp.where(take, last, new)
+            return (moved, *likelihoods), None
 
         return jax.lax.scan(move, (z, old, new), jax.random.split(key, num_moves))[0]
 
@@ -310,11 +266,8 @@ class ParticleTask:
         candidates: ArrayLike,
         *,
         measurements: int,
-        seconds: float = float("inf"),
         cost: ArrayLike = 0.0,
-        particles: int = 600,
-        contrasts: int = 100,
-        moves: int = 3,
+        **rest: Any,
     ) -> ParticleTask:
         """A model of ``jaxcal.models``, measured at one of its candidates at a time.
 
@@ -331,23 +284,15 @@ class ParticleTask:
             noise: of a reading (q,); the model's usual one when None.
             candidates: (M, n) commands.
             measurements: of a session.
-            seconds: budget of a session, in what ``cost`` counts.
             cost: of a measurement: a number or (M,).
-            particles, contrasts, moves: as of ``make``.
+            rest: ``seconds``, ``particles``, ``contrasts``, ``moves`` of ``make``.
 
         Raises:
             ValueError: naming the argument, the rule and the value.
         """
-        at_candidates = candidates_of(model, prior, noise, candidates, cost)
-        return ParticleTask.make(
-            at_candidates,
-            measurements,
-            seconds=seconds,
-            particles=particles,
-            candidates=len(at_candidates.commands),
-            contrasts=contrasts,
-            moves=moves,
-        )
+        of_model = candidates_of(model, prior, noise, candidates, cost)
+        count = len(of_model.commands)
+        return ParticleTask.make(of_model, measurements, candidates=count, **rest)
 
     @property
     def designs(self) -> jax.Array | None:
@@ -460,7 +405,7 @@ def _check(task: ParticleTask) -> None:
 
 @jit_by_class
 def _tried(task: ParticleTask) -> tuple[jax.Array, ...]:
-    """(A,) costs, (A,) outcomes, (A,) their log probabilities, (A,) of all outcomes."""
+    """(A,) costs, outcomes, their log probabilities, and the sum of all outcomes'."""
     model, keys = task.model, jax.random.split(jax.random.key(0), 4)
     belief, session = task.begin(keys[0])
     options = task.options(belief, session, keys[1])
@@ -472,12 +417,5 @@ def _tried(task: ParticleTask) -> tuple[jax.Array, ...]:
     log_prob = jax.vmap(model.log_prob)(predictions, outcomes)
     if model.support is None:
         return options.seconds, outcomes, log_prob, jnp.ones(1)
-    support_log_prob = jax.vmap(
-        lambda p: jax.vmap(lambda y: model.log_prob(p, y))(model.support)
-    )
-    return (
-        options.seconds,
-        outcomes,
-        log_prob,
-        jnp.exp(support_log_prob(predictions)).sum(axis=-1),
-    )
+    total = jnp.exp(log_prob_of_all(model, predictions)).sum(axis=-1)
+    return options.seconds, outcomes, log_prob, total

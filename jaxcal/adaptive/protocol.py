@@ -1,10 +1,9 @@
 """A closed loop for other programs: a JSON object per line, each with an answer.
 
-``suggest``, ``observed`` and ``state`` are what ``do`` may be: see docs/adaptive.md.
-``number`` counts measurements. ``observed`` takes the outcome of what was suggested;
-with a ``design``, an index or coordinates, that of another one; with a ``number`` it
-is refused unless that measurement is the next, so a program that does not know whether
-its last line arrived sends it again. What is wrong is answered by ``{"error": ...}``.
+``do`` is ``suggest``, ``observed`` or ``state``: see docs/adaptive.md. ``observed``
+takes the outcome of what was suggested, or with a ``design`` that of another one; with
+a ``number`` it is refused unless that measurement is the next, so a program that does
+not know whether its last line arrived sends it again.
 """
 
 from __future__ import annotations
@@ -20,11 +19,7 @@ import numpy as np
 
 from jaxcal.adaptive.loop import Loop, estimates
 
-_FIELDS = {
-    "suggest": set(),
-    "observed": {"outcome", "design", "number"},
-    "state": set(),
-}
+_FIELDS = {"suggest": (), "observed": ("outcome", "design", "number"), "state": ()}
 
 
 def answers(loop: Loop, lines: Iterable[str]) -> Iterator[str]:
@@ -51,10 +46,10 @@ def _answer(loop: Loop, line: str) -> dict[str, Any]:
             f"a request must be a JSON object on one line: {error}"
         ) from None
     asked = request.get("do") if isinstance(request, dict) else None
-    if asked not in _FIELDS:
+    if asked not in tuple(_FIELDS):  # a list has no hash
         requests = ", ".join(_FIELDS)
         raise ValueError(f"do must be one of {requests}, got {line.strip()[:80]}")
-    if more := set(request) - {"do"} - _FIELDS[asked]:
+    if more := set(request) - {"do", *_FIELDS[asked]}:
         raise ValueError(f"{asked} takes no {min(more)!r}")
     number = int(loop.session.made)
     if asked == "suggest":
@@ -75,38 +70,27 @@ def _suggested(loop: Loop) -> dict[str, Any]:
     proposal = loop.suggest()
     if proposal.design is None:
         return {"number": proposal.number, "over": True}
-    return {
-        "number": proposal.number,
-        "design": _plain(proposal.design),
-        "coordinates": _plain(proposal.coordinates),
-        "gain": proposal.gain,
-        "seconds": proposal.seconds,
-        "uses": proposal.uses,
-    }
+    answer: dict[str, Any] = {"number": proposal.number}
+    for name in ("design", "coordinates"):
+        value = getattr(proposal, name)
+        answer[name] = jax.tree.map(lambda leaf: np.asarray(leaf).tolist(), value)
+    return answer | {n: getattr(proposal, n) for n in ("gain", "seconds", "uses")}
 
 
 def _state(loop: Loop) -> dict[str, Any]:
-    session = loop.session
-    named = hasattr(loop.task, "theta_names") or hasattr(loop.belief.model, "names")
+    session, belief = loop.session, loop.belief
+    named = hasattr(loop.task, "theta_names") or hasattr(belief.model, "names")
+    unknowns = estimates(loop.task, belief) if named else {}
     return {
         "number": int(session.made),
         "over": bool(loop.task.over(session)),
         "seconds": _finite(session.seconds),
         "uses": int(session.uses),
-        "entropy": _finite(loop.belief.entropy()),
-        "unknowns": {
-            name: dataclasses.asdict(one)
-            for name, one in estimates(loop.task, loop.belief).items()
-        }
-        if named
-        else {},
+        "entropy": _finite(belief.entropy()),
+        "unknowns": {name: dataclasses.asdict(unknowns[name]) for name in unknowns},
     }
 
 
 def _finite(value: Any) -> float | None:
     """A number, or null where there is none."""
     return float(value) if math.isfinite(value) else None
-
-
-def _plain(value: Any) -> Any:
-    return jax.tree.map(lambda leaf: np.asarray(leaf).tolist(), value)

@@ -34,13 +34,7 @@ def groups_of(task: Any, count: int) -> tuple[jax.Array, int]:
 def shortlist(
     task: Any, score: jax.Array, options: Options, per_group: int
 ) -> tuple[jax.Array, jax.Array]:
-    """The options of the largest scores, some of each of the task's groups.
-
-    Args:
-        task: ``num_groups`` and ``groups`` (A,) of its options; one group without them.
-        score: (A,).
-        options: what is not allowed is not listed.
-        per_group: at most so many of each group.
+    """The allowed options of the largest scores (A,), at most ``per_group`` a group.
 
     Returns:
         (C,) int32 indices and (C,) bool where one is listed: a group of fewer options
@@ -109,6 +103,7 @@ class Rule(abc.ABC):
         changed |= {n: getattr(self, n) + by[i] for n, i in self.exponents.items()}
         return dataclasses.replace(self, **changed)  # type: ignore[type-var]  # flax
 
+    @abc.abstractmethod
     def price(
         self, task: Any, session: Session, options: Options, *expected: jax.Array
     ) -> jax.Array:
@@ -116,7 +111,6 @@ class Rule(abc.ABC):
 
         ``expected``: their gains, seconds and uses, (A,) each.
         """
-        raise NotImplementedError("a Rule defines price, or judged")  # one of both
 
     def judged(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array

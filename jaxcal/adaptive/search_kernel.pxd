@@ -14,7 +14,6 @@ cdef class Tree:
     cdef float[:, ::1] extra  # (Y, D)
     cdef float[:, ::1] uses  # (Y, D)
     cdef int[:, ::1] place_after  # (A, Y)
-    cdef float[::1] allowed  # (D,) 1 or 0
     cdef float[::1] most_extra  # (D,) seconds that must be left, besides the way
     cdef float[::1] most_uses  # (D,) uses that must be left
     cdef float[:, ::1] hints  # (N, D) multiples of scores
@@ -38,7 +37,7 @@ cdef class Tree:
     cdef float[:, ::1] scores
     cdef float[:, ::1] seconds
     cdef float[:, ::1] needs
-    cdef float[:, ::1] open  # 1 where allowed and paid for, else 0
+    cdef float[:, ::1] open  # 1 where paid for, else 0
     cdef double[::1] guess
     cdef float[::1] belief  # of the session that is played
     cdef int _best(self, float* belief, State now) noexcept nogil

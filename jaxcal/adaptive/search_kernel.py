@@ -110,7 +110,7 @@ class Tree:
 
     def __init__(
         self, likelihood, travel, extra, uses, place_after, most_extra, most_uses,
-        allowed, horizon, constants, hints, effort,
+        horizon, constants, hints, effort,
     ):  # fmt: skip
         # As in GridTask, but for extra and uses, (Y, A). Hints are (N, A), the last for
         # the Nth measurement and all that follow.
@@ -122,15 +122,12 @@ class Tree:
         self.time, use, self.a, b, self.haste, self.doubt = constants
         e = np.arange(1.0, _USES + 1)
         self.use_of = use * e ** (b - 1.0)
-        (
-            self.travel, self.extra, self.uses, self.most_extra, self.most_uses,
-            self.allowed, self.hints,
-        ) = (
+        self.travel, self.extra, self.uses, self.most_extra, self.hints = (
             np.pad(table, [(0, 0)] * (table.ndim - 1) + [(0, more)])
-            for table in (
-                travel, extra, uses, most_extra, most_uses, allowed, hints * allowed,
-            )
-        )  # fmt: skip
+            for table in (travel, extra, uses, most_extra, hints)
+        )
+        # What is padded can never be paid.
+        self.most_uses = np.pad(most_uses, (0, more), constant_values=1e30)
         # Of each state L of all outcomes but the first, then the sum of L log L.
         noise = likelihood * np.log(np.where(likelihood > 0.0, likelihood, 1.0))
         rows = [*likelihood.transpose(1, 2, 0)[1:], noise.sum(axis=1).T]
@@ -420,19 +417,19 @@ class Tree:
         return (gains[best[0]] + least) / fmax(scores[best[0]], 1e-30)
 
     def _open(self, level, now):
-        """Which designs are allowed and paid for by what is left, whatever comes."""
+        """Which designs are paid for by what is left, whatever comes."""
         travel = cython.address(self.travel[now.place, 0])
-        allowed = cython.address(self.allowed[0])
         most_extra = cython.address(self.most_extra[0])
         most_uses = cython.address(self.most_uses[0])
         open = cython.address(self.open[level, 0])
         zero: cython.float = 0.0
+        one: cython.float = 1.0
         rounding: cython.float = 0.9999  # as ``session.pays``
         seconds_left: cython.float = now.seconds
         uses_left: cython.float = now.uses
         for a in range(self.designs):
             cost = rounding * (travel[a] + most_extra[a])
-            open[a] = allowed[a] if cost <= seconds_left else zero
+            open[a] = one if cost <= seconds_left else zero
         for a in range(self.designs):
             open[a] = open[a] if most_uses[a] <= uses_left else zero
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,6 @@ def tune(
     population: int = 24,
     elite: int = 6,
     seed: int = 0,
-    nats_of: Callable[[Any, R, jax.Array], float] | None = None,
     report: Callable[[int, float, R], None] = lambda number, nats, rule: None,
 ) -> R:
     """The rule with the constants that gain most on a task's sessions.
@@ -44,7 +43,6 @@ def tune(
         episodes: sessions of a generation.
         generations, population, elite: of the cross-entropy method.
         seed: of the sessions and of the search.
-        nats_of: what is maximised, of task, rule and keys; the mean of nats when None.
         report: called after each generation with its number, the elite's mean of nats
             and the rule at its centre.
     """
@@ -56,11 +54,8 @@ def tune(
         )
 
     def nats(rule: R, number: int) -> float:
-        keys = jax.random.split(
-            jax.random.fold_in(jax.random.key(seed), number), episodes
-        )
-        if nats_of is not None:
-            return nats_of(task, rule, keys)
+        key = jax.random.fold_in(jax.random.key(seed), number)
+        keys = jax.random.split(key, episodes)
         arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), rule)
         return float(play(task, arrays, keys).gain.mean())
 

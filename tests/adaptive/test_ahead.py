@@ -7,14 +7,14 @@ import pytest
 from scipy import special
 
 from benchmarks.sequential.family.draws import draw
-from benchmarks.sequential.family.padded import pad, stack
+from benchmarks.sequential.family.padded import pad
 from benchmarks.sequential.family.structures import Limits
 from benchmarks.sequential.optimum import solve
 from jaxcal.adaptive import lookahead
 from jaxcal.adaptive.episodes import compare
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import Ahead
-from jaxcal.adaptive.rules import SHARES, log_score
+from jaxcal.adaptive.rules import SHARES
 from jaxcal.adaptive.tasks.knee import knee
 
 choose = jax.jit(
@@ -96,34 +96,17 @@ def test_nearly_the_optimum_where_it_is_known():
     assert found.paired("ahead", "shares")[0] > 0.01
 
 
-@pytest.mark.slow
-def test_padded_tasks_are_decided_as_each_alone_and_without_effort_as_shares():
+def test_other_kinds_are_decided_as_by_shares_and_a_batch_of_tasks_is_refused():
     limits = Limits(64, 24, 4, measurements=12)
-    tasks = [draw(seed, limits=limits) for seed in (1, 2, 5)]
-    tables = jax.tree.map(jnp.asarray, stack([pad(task, limits) for task in tasks]))
-    keys = jax.random.split(jax.random.key(1), 32)
-
-    def decide(task, key):
-        """Two choices, and by how much the second's score is below the best."""
-        belief, session = task.begin(key)
-        spread = jnp.exp(jax.random.normal(key, (8,)))[jnp.arange(64) % 8]
-        weights = belief.weights * spread[: len(belief.weights)]
-        belief = belief.replace(weights=weights / weights.sum())
-        options = task.options(belief, session)
-        gains, prices = SHARES.judged(task, belief, session, options, key)
-        score = jnp.where(options.allowed, log_score(gains, prices), -jnp.inf)
-        deciders = Ahead(), Ahead(effort=0.0)
-        ahead, none = (d(task, belief, session, options, key) for d in deciders)
-        return ahead, score.max() - score[none], ahead != jnp.argmax(score)
-
-    each = jax.jit(jax.vmap(decide, in_axes=(None, 0)))
-    batch = jax.jit(jax.vmap(jax.vmap(decide, in_axes=(None, 0)), in_axes=(0, None)))
-    chosen, less, other = (np.asarray(leaf) for leaf in batch(tables, keys))
-    assert less.max() < 1e-3 and other.any()
-    for number, task in enumerate(tasks):
-        alone = each(jax.tree.map(lambda leaf, at=number: leaf[at], tables), keys)[0]
-        assert (np.asarray(alone) == chosen[number]).mean() > 0.95  # others are level
-        assert chosen[number].max() < len(task.designs)
+    padded = jax.tree.map(jnp.asarray, pad(draw(1, limits=limits), limits))
+    belief, session = padded.begin(jax.random.key(0))
+    chosen = choose(padded, WHOLE, belief, session)
+    assert int(chosen) == int(choose(padded, SHARES, belief, session))
+    task = random_task(0, 4, 2, 3, True)
+    both = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), task)
+    keys = jax.random.split(jax.random.key(0), 2)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="one task at a time"):
+        jax.vmap(lambda task, key: choose(task, WHOLE, *task.begin(key)))(both, keys)
 
 
 @pytest.mark.parametrize("overrun", [True, False])

@@ -41,7 +41,7 @@ DECIDERS = {
     "shares": lambda of: SHARES,
     "state": lambda of: RULE,
     "ahead": lambda of: AHEAD,
-    "fitted": lambda of: fit(of).decider,
+    "fitted": lambda of: fit(of),
     "policy": lambda of: PolicyDecider(initial(jax.random.key(0), 4, 1, 8), RULE, 4, 8),
 }
 QUICK = ("random", "state")

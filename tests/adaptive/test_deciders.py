@@ -51,7 +51,6 @@ def no_clock():
         rng.normal(size=(4, 1)),
         rng.dirichlet(np.ones(3), size=(4, 5)).transpose(0, 2, 1),
         travel=rng.uniform(1, 3, (6, 4)),
-        place=4,
         place_after=np.full((4, 3), 5),
         uses=[0, 1, 2],
         num_uses=4,

@@ -191,7 +191,7 @@ def test_the_default_looks_ahead_where_time_or_uses_count():
     counted, free = knee(8, sigma=0.05), draw(3, "band", "number", SHAPE)
     made = [(5, 0)]
     mine = next_measurement(counted, made, **budget)
-    fitted = fit(counted, **budget).decider
+    fitted = fit(counted, **budget)
     assert (
         mine.design == next_measurement(counted, made, fitted, **budget, seed=3).design
     )

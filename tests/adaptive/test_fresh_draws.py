@@ -13,10 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.sequential.deciders import TwoStep
 from jaxcal.adaptive.episodes import play
 from jaxcal.adaptive.loop import next_measurement
-from jaxcal.adaptive.rules import Gain, Priced
+from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.tasks import registry
 from jaxcal.commands import train as train_command
 
@@ -134,44 +133,3 @@ def test_ppo_is_rewarded_with_what_an_option_tells(path, tmp_path):
     assert float(row["choices"]) == 1.0
     # 4,096 sessions of one choice each; the standard error is below 0.001.
     assert float(row["reward_mean"]) == pytest.approx(EXACT, abs=0.005)
-
-
-def test_two_steps_draw_candidates_and_judge_them_by_different_draws(task):
-    """No key is spent twice, so nothing is judged by the draws that proposed it."""
-    spent = []
-
-    class Watched:
-        """A belief that notes the keys it is asked with."""
-
-        def __init__(self, belief):
-            self.belief = belief
-
-        def gains(self, task, options, key):
-            spent.append(("gains", key))
-            return self.belief.gains(task, options, key)
-
-        def outcomes(self, task, design, key):
-            spent.append(("outcomes", key))
-            return self.belief.outcomes(task, design, key)
-
-        def update(self, task, design, outcome, key):
-            spent.append(("update", key))
-            return Watched(self.belief.update(task, design, outcome, key))
-
-        def draws(self, count, key):
-            spent.append(("options", key))
-            return self.belief.draws(count, key)
-
-    long = task.replace(horizon=3)
-
-    @jax.jit
-    def keys():
-        belief, session = long.begin(jax.random.key(0))
-        options = long.options(belief, session, jax.random.key(1))
-        decider = TwoStep(Priced(1.0, 0.0, 0.0), per_group=2)
-        decider(long, Watched(belief), session, options, jax.random.key(2))
-        return [jax.random.key_data(key) for _, key in spent]
-
-    data = [np.asarray(key).tobytes() for key in keys()]
-    assert {name for name, _ in spent} == {"gains", "outcomes", "update", "options"}
-    assert len(set(data)) == len(data)

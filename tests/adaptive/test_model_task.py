@@ -167,7 +167,7 @@ def test_a_loop_with_a_budget_that_is_killed_goes_on(tmp_path):
         ({"prior": lambda z: z[:2]}, r"prior must return \(3,\) finite parameters"),
         ({"noise": None}, "noise is missing"),
         ({"noise": Noise(std=1.0, command_std=np.inf)}, "command_std must be finite"),
-        ({"cost": [1.0, 2.0]}, r"cost must be a number or \(7,\), at least 0"),
+        ({"cost": [1.0, 2.0]}, r"cost must be one number or \(7,\), got \(2,\)"),
         ({"candidates": np.full((2, 1), np.nan)}, "must be finite"),
         ({"measurements": 0}, "horizon must be at least 1"),
     ],

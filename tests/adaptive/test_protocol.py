@@ -65,7 +65,7 @@ def test_a_session_is_that_of_the_loop(task):
         )
         assert state["number"] == 1 and state["seconds"] is None and not state["over"]
         other, then = asked(
-            loop, {"do": "observed", "outcome": 0, "design": [0.125]}, {"do": "suggest"}
+            loop, {"do": "observed", "outcome": 0, "design": 0}, {"do": "suggest"}
         )
         assert other == {"number": 2} and then["number"] == 2
         assert [int(design) for design, _ in loop.history] == [3, 0]
@@ -94,7 +94,7 @@ def test_an_outcome_that_is_sent_twice_counts_once_and_the_end_is_told(task):
         ('{"do": "suggest", "seed": 3}', "suggest takes no 'seed'"),
         ('{"do": "observed"}', "observed needs the outcome"),
         ('{"do": "observed", "outcome": 2}', "whole number in [0, 2), got 2"),
-        ('{"do": "observed", "outcome": 0, "design": 9}', "must lie in [0, 7), got 9"),
+        ('{"do": "observed", "outcome": 0, "design": 9}', "number in [0, 7), got 9"),
     ],
 )
 def test_what_is_wrong_is_answered_and_changes_nothing(task, line, message):

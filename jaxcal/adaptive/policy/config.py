@@ -42,11 +42,8 @@ class PolicyConfig(RunConfig):
     def __post_init__(self) -> None:
         require(self, "at least 1", lambda v: v >= 1, "per_group", "width")
         super().__post_init__()
-        known = ", ".join(_rules())
-        if not isinstance(self.base, tuple(_rules().values())):
-            raise ValueError(
-                f"base must be one of {known}, got {type(self.base).__name__}"
-            )
+        if (name := type(self.base).__name__) not in (rules := _rules()):
+            raise ValueError(f"base must be one of {', '.join(rules)}, got {name}")
 
     @property
     def learners(self) -> tuple[Streams, ...]:
@@ -58,15 +55,13 @@ class PolicyConfig(RunConfig):
 
     def as_meta(self) -> dict[str, Any]:
         """Plain JSON values; ``from_meta`` reads them back."""
-        constants = {
-            field.name: float(getattr(self.base, field.name))
-            for field in dataclasses.fields(self.base)  # type: ignore[arg-type]  # flax
-        }
+        base: Any = self.base
+        constants = {name: float(x) for name, x in dataclasses.asdict(base).items()}
         return super().as_meta() | {
             "task": self.task,
             "options": [dict(self.options)],
             "network": {"width": self.width, "per_group": self.per_group},
-            "base": {"rule": type(self.base).__name__, **constants},
+            "base": {"rule": type(base).__name__, **constants},
         }
 
     @staticmethod

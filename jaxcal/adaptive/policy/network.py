@@ -26,9 +26,9 @@ _STEP = 3.0  # logits per unit of the network's output, so that it learns faster
 
 @struct.dataclass
 class Shortlist:
-    """A shortlist of C options."""
+    """A shortlist of C options; a network reads the last three fields."""
 
-    index: jax.Array  # (C,) int32 into the options
+    index: Any  # (C,) int32 into the options
     designs: Any  # leaves (C, ...) of those options
     features: jax.Array  # (C, NUM_FEATURES)
     log_score: jax.Array  # (C,) of the base rule, less its maximum
@@ -123,11 +123,9 @@ def _along(task: Any, count: int) -> jax.Array:
 
 
 def _left_after(task: Any, belief: Any, count: int) -> tuple[jax.Array, jax.Array]:
-    """(A,) expected entropy after outcomes that take uses, and after those that do not.
-
-    0 where the belief has no ``entropies_after`` or there are no such outcomes.
-    """
-    if not hasattr(belief, "entropies_after"):
+    """(A,) expected entropy after outcomes that take uses, and after those that do not;
+    0 where there are none, and of particles."""
+    if not isinstance(task, GridTask):
         return jnp.zeros(count), jnp.zeros(count)
     p, after = belief.predictive(task), belief.entropies_after(task)
     chances = (jnp.where(task.uses > 0, p, 0.0), jnp.where(task.uses > 0, 0.0, p))
@@ -175,9 +173,8 @@ class PolicyDecider:
     def __call__(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
     ) -> jax.Array:
-        seen = shortlist_of(
-            task, belief, session, options, key, self.base, self.per_group
-        )
+        given = task, belief, session, options, key
+        seen = shortlist_of(*given, self.base, self.per_group)
         logits, _ = Correction(self.width).apply(self.params, seen)
         return seen.index[jnp.argmax(logits)]
 
@@ -185,13 +182,8 @@ class PolicyDecider:
 def initial(key: jax.Array, per_group: int, num_groups: int, width: int = 64) -> Any:
     """Parameters before training."""
     c = per_group * num_groups
-    blank = Shortlist(
-        index=jnp.zeros(c, jnp.int32),
-        designs=jnp.zeros(c),
-        features=jnp.zeros((c, NUM_FEATURES)),
-        log_score=jnp.zeros(c),
-        valid=jnp.ones(c, bool),
-    )
+    features, valid = jnp.zeros((c, NUM_FEATURES)), jnp.ones(c, bool)
+    blank = Shortlist(None, None, features, jnp.zeros(c), valid)
     return Correction(width).init(key, blank)
 
 
@@ -227,12 +219,10 @@ class Sessions:
         """The shortlist."""
         key_options, key_observe = jax.random.split(key)
         belief, session = state.belief, state.session
-        options = task.task.options(belief, session, key_options)
-        return shortlist_of(
-            *(task.task, belief, session, options, key_observe),
-            task.base,
-            self.per_group,
-        )
+        made = task.task
+        options = made.options(belief, session, key_options)
+        given = made, belief, session, options, key_observe
+        return shortlist_of(*given, task.base, self.per_group)
 
     def step(
         self,
@@ -263,10 +253,5 @@ class Sessions:
             return State(state.truth, then, session), made.over(session)
 
         states, ended = jax.vmap(after)(outcomes)
-        return Step(
-            reward=belief.gain(made, design, key_gain),
-            states=states,
-            ended=ended,
-            chance=chance,
-            happened=happened,
-        )
+        gain = belief.gain(made, design, key_gain)
+        return Step(gain, states, ended, chance, happened)
