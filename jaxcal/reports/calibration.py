@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import os
 import pathlib
@@ -230,16 +231,9 @@ def _verdict_section(calibration: Fit, document: Mapping[str, Any]) -> pages.Sec
     word = "good" if good else "not good"
     if document["of"] == "check":
         word = str(numbers["check_says"])
-    units = {
-        name: "" if quantity.unit == "length" else quantity.unit
-        for of_errors in (
-            "residual_rms",
-            "held_out_mean",
-            "nominal_mean",
-            "check_tolerance",
-        )
-        for name, quantity in named(calibration, of_errors)
-    }
+    sizes = "residual_rms", "held_out_mean", "nominal_mean", "check_tolerance"
+    all_named = itertools.chain.from_iterable(named(calibration, n) for n in sizes)
+    units = {name: q.unit for name, q in all_named if q.unit != "length"}
     rows = [
         [name.replace("_", " "), f"{_text(value)} {units.get(name, '')}".strip()]
         for name, value in numbers.items()
