@@ -1,9 +1,8 @@
 """How long moves take, and the order in which they take least.
 
 A move is a trapezoid profile on every axis (accelerate, cruise, brake), all axes start
-together and the slowest sets the time. Each axis' time is a concave function of its
-distance that is zero at zero, so the travel time is a metric. Loads numpy alone
-until an order is asked for.
+together and the slowest sets the time, which is a metric. Loads numpy alone until an
+order is asked for.
 """
 
 from __future__ import annotations
@@ -39,8 +38,7 @@ class Motion:
 
 
 def travel_times(points: ArrayLike, others: ArrayLike, motion: Motion) -> Array:
-    """(A, B) seconds from each of postures (A, n) to each of others (B, n), not
-    settling.
+    """(A, B) seconds from each of postures (A, n) to others (B, n), not settling.
 
     An axis that moves d at speed v and acceleration a takes ``d / v + v / a``, or ``2
     sqrt(d / a)`` where it never reaches v (d < v^2 / a); the slowest axis counts.
@@ -63,12 +61,10 @@ def travel_times(points: ArrayLike, others: ArrayLike, motion: Motion) -> Array:
 def fastest_tour(
     times: ArrayLike, start: ArrayLike | None = None
 ) -> tuple[NDArray[np.int64], float]:
-    """The (K,) order of least time through all postures, ending anywhere, and its
-    seconds.
+    """(K,) order of least time through all postures, ending anywhere, and its seconds.
 
     Optimal up to 12 postures (Held and Karp 1962); beyond, the shortest
-    nearest-neighbour tours are improved by 2-opt and moves of single postures, which
-    proves nothing.
+    nearest-neighbour tours are improved by 2-opt and moves of single postures.
 
     Args:
         times: (K, K) seconds from each posture to each, symmetric.

@@ -1,9 +1,8 @@
-"""Which postures, in which order, so that a run takes little time; the trade-off.
+"""Which postures, in which order, so that a run takes little time: a heuristic.
 
-A heuristic: local search starts from the D-optimum and local optima of the exchange and
-swaps one posture at a time where that keeps the determinant and shortens the tour;
-random swaps then lead away from a local optimum. The order of the postures found is
-proven up to 12 (Held and Karp), the choice of them is not.
+Local search from the D-optimum and local optima of the exchange swaps one posture at a
+time where that keeps the determinant and shortens the tour; random swaps then lead away
+from a local optimum.
 """
 
 from __future__ import annotations
@@ -81,12 +80,8 @@ def fastest(
         time_limit: seconds of the search for the D-optimum.
         seed: of the starts and of the random swaps.
 
-    Returns:
-        The selection, its postures in the order to visit.
-
     Raises:
-        ValueError: naming the argument, the rule and the value; of scenarios and
-            replicates, which have no such run.
+        ValueError: also of scenarios and replicates, which have no such run.
     """
     least = share("least_efficiency", least_efficiency)
     search = _TourSearch(design.candidate_set, k, motion, start, time_limit, seed)
@@ -107,24 +102,18 @@ def pareto(
     least_efficiency: float = 0.7,
     **options: Any,
 ) -> ParetoFront:
-    """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
+    """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum: each
+    point is the fastest run found that is more efficient than the one before it.
 
-    Each point is the fastest run found that is more efficient than the one before it.
-
-    Args:
-        design: what may be measured; ``design.pareto(k, motion)`` asks the same.
-        k, motion: as in ``fastest``.
-        least_efficiency: where to cut the front off, in (0, 1].
-        options: start, seed and time_limit of ``fastest``.
+    ``k``, ``motion`` and the options start, seed and time_limit are as in ``fastest``.
     """
     least = share("least_efficiency", least_efficiency)
     search = _TourSearch(design.candidate_set, k, motion, **options)
-    points: list[FastSelection] = []
+    points, front = list[FastSelection](), list[FastSelection]()
     point = search.answer(least, None)
     while point is not None and len(points) < _MOST_POINTS:
         points.append(point)
         point = search.answer(least, point.log_det)
-    front: list[FastSelection] = []
     for point in sorted(points, key=lambda point: -point.log_det):
         if not front or point.seconds < front[-1].seconds - SAME_TIME:
             front.append(point)
@@ -180,26 +169,22 @@ class _TourSearch:
         self.optimum = solve_exact(problem, deadline=deadline)
 
     def answer(self, least: float, above: float | None) -> FastSelection | None:
-        """The fastest run of an efficiency, and log det S over ``above``; None: none
-        found."""
+        """The fastest run of an efficiency, and log det S over ``above``, if found."""
         begun, problem, optimum = time.perf_counter(), self.problem, self.optimum
         m, scale = problem.multiplicity, problem.white.log_scale
         # Whitened. The optimum itself must meet its own value; a bound that is not the
         # optimum asks too much of a subset, never too little.
         assert optimum.bound is not None
-        least_log_det = (
-            optimum.bound / m - scale + problem.num_regressors * np.log(least)
-        )
-        least_log_det -= 1e-12
+        wanted = optimum.bound / m - scale + problem.num_regressors * np.log(least)
+        wanted -= 1e-12
         if above is not None:
-            least_log_det = max(least_log_det, above / m - scale + SAME_TIME)
+            wanted = max(wanted, above / m - scale + SAME_TIME)
         rng = np.random.default_rng(self.seed)
-        chosen, travel = self._local(least_log_det, rng)
+        chosen, travel = self._local(wanted, rng)
         if chosen is None:
             return None
         for _ in range(_KICKS):
-            kicked = self._kicked(chosen, least_log_det, rng)
-            other, after = self._shortened(kicked, least_log_det)
+            other, after = self._shortened(self._kicked(chosen, wanted, rng), wanted)
             if after < travel - SAME_TIME:
                 chosen, travel = other, after
         tour, travel = self._tour(chosen)
@@ -220,8 +205,7 @@ class _TourSearch:
     def _local(
         self, wanted: float, rng: np.random.Generator
     ) -> tuple[Indices | None, float]:
-        """The fastest subset (k,) from near-optimal ones, and its travel; None: none
-        reaches it."""
+        """The fastest subset (k,) from near-optimal ones, if any, and its travel."""
         starts = [self.optimum.indices] + [
             exchange_indices(self.problem, 1, int(rng.integers(2**31)))
             for _ in range(_STARTS - 1)
@@ -271,23 +255,19 @@ class _TourSearch:
         return tour, travel
 
     def _refills(self, kept: Indices, wanted: float) -> list[tuple[float, Indices]]:
-        """Ways to complete k - 1 postures to k: seconds, ascending, and (k,) subset of
-        each.
-
-        The new posture is inserted where it adds least to the tour (k - 1,); the
-        whitened log det ``wanted`` is met to 1e-6.
-        """
+        """Ways to complete a tour (k - 1,), the new posture where it adds least: (k,)
+        subsets and their seconds, ascending; ``wanted`` is met to 1e-6."""
         times, begin = self.times, self.start
-        legs = np.concatenate([begin[kept[:1]], times[kept[:-1], kept[1:]], [0.0]])
         others = np.setdiff1d(np.arange(len(self.blocks)), kept)
+        legs = np.concatenate([begin[kept[:1]], times[kept[:-1], kept[1:]], [0.0]])
+        to_others = times[np.ix_(kept, others)]
         _, q, p = self.blocks.shape
         lower = np.linalg.cholesky(self._information(kept) + _RIDGE * np.eye(p))
         rows = self.blocks[others].reshape(-1, p)
         y = np.linalg.solve(lower, rows.T).T.reshape(-1, q, p)
-        # Factor of the determinant.
-        factor = np.linalg.det(np.eye(q) + y @ np.matrix_transpose(y))
-        into = np.vstack([begin[others], times[np.ix_(kept, others)]])
-        onward = np.vstack([times[np.ix_(kept, others)], np.zeros(len(others))])
+        factor = np.linalg.det(np.eye(q) + y @ np.matrix_transpose(y))  # of det
+        into = np.vstack([begin[others], to_others])
+        onward = np.vstack([to_others, np.zeros(len(others))])
         travel = (into + onward - legs[:, None]).min(axis=0)
         value = np.log(np.maximum(factor, 1e-300)) + 2.0 * np.log(np.diag(lower)).sum()
         travel = np.where(value >= wanted - 1e-6, travel + legs.sum(), np.inf)
