@@ -101,7 +101,7 @@ calls = {
     ),
     "volumes": lambda: jaxcal.select(sphere, 10, "exact", time_limit=300),
     "look-ahead": lambda: look_ahead(
-        y, active, True, 40, False, None, np.empty((4, 60_000))
+        y, active, True, 40, False, np.empty((4, 60_000))
     ),
 }
 for name, call in calls.items():

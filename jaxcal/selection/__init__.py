@@ -5,9 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from jaxcal.selection.criteria import As, Ds, I
+from jaxcal.selection.criteria import As, Ds, I, Mean, Worst
 from jaxcal.selection.design import Design, select
-from jaxcal.selection.problem.scenarios import Mean, Worst
 from jaxcal.selection.result import Selection
 
 __all__ = [

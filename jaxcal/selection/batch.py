@@ -1,7 +1,5 @@
-"""The solvers over many candidate sets at once.
-
-The solvers take candidates (B, M, n) and k, and by keyword ``available`` (B, M) bool,
-``required`` (B, r), ``max_replicates`` and ``num_outputs`` as ``select`` does.
+"""The solvers over many candidate sets (B, M, n) at once; by keyword ``available`` (B,
+M) bool, ``required`` (B, r), ``max_replicates`` and ``num_outputs``, as ``select``.
 """
 
 from __future__ import annotations
@@ -75,11 +73,8 @@ def exchange_batch(
 def exact_batch(
     candidates: ArrayLike, k: int, *, time_limit: float | None = None, **rules: Any
 ) -> BatchSelection:
-    """The proven optimum of every set.
-
-    ``time_limit`` is in seconds for the whole batch, after which the remaining sets
-    return the best found with ``proven`` False; there is no limit when it is None.
-    """
+    """The proven optimum of every set; ``time_limit``: seconds for the whole batch,
+    after which the remaining sets return the best found with ``proven`` False."""
     deadline = NEVER if time_limit is None else Deadline(time_limit)
     one = functools.partial(solve_exact, deadline=deadline)
 
@@ -116,14 +111,7 @@ def _solved(
             f"candidates of set {singular[0]} allow no invertible selection: {method} "
             f"ended in one plane at {indices[singular[0]].tolist()}"
         )
-    return BatchSelection(
-        indices=indices,
-        log_det=values,
-        proven=np.array([one.proven for one in solutions]),
-        bound=np.array(
-            [np.inf if one.bound is None else one.bound for one in solutions]
-        ),
-        nodes=np.array([one.nodes or 0 for one in solutions]),
-        method=method,
-        seconds=time.perf_counter() - start,
-    )
+    proven = np.array([one.proven for one in solutions])
+    bounds = np.array([np.inf if x.bound is None else x.bound for x in solutions])
+    nodes, spent = np.array([x.nodes or 0 for x in solutions]), time.perf_counter()
+    return BatchSelection(indices, values, proven, bounds, nodes, method, spent - start)

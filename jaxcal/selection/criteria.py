@@ -23,10 +23,11 @@ Atkinson, Donev and Tobias, Optimum Experimental Designs.
 
 from __future__ import annotations
 
+import copy
 import functools
-import inspect
 import math
 from collections.abc import Iterable, Sequence
+from inspect import signature
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -55,11 +56,8 @@ class Coordinates(NamedTuple):
 
 
 class Criterion:
-    """A criterion; subclasses are the rows of ``CRITERIA``.
-
-    As it is asked for it carries its data. ``within`` gives that of one problem, which
-    has ``root`` and what follows, in the coordinates of the problem.
-    """
+    """A criterion as it is asked for, with its data; ``within`` gives that of one
+    problem, which has ``root`` and what follows, in the problem's coordinates."""
 
     name: ClassVar[str]
     kind: ClassVar[str]  # "det", "trace" or "least"
@@ -67,9 +65,7 @@ class Criterion:
     per_output: ClassVar[bool] = False  # the value is one output's, not their sum
     of_region: ClassVar[bool] = False  # it is about predictions, see ``region``
     of_each: ClassVar[bool] = False  # and about each alone, whatever they say together
-    by_name: ClassVar[bool] = (
-        False  # it tells the parameters apart, ``Coordinates.names``
-    )
+    by_name: ClassVar[bool] = False  # it tells the parameters apart
     of_parameters: ClassVar[bool] = False  # made of some of them: ``Ds(parameters)``
     region: ArrayLike | None = None  # commands or blocks where; the candidates if None
 
@@ -101,11 +97,8 @@ class Criterion:
         return at.basis
 
     def within(self, at: Coordinates) -> Self:
-        """The criterion in the coordinates of one problem.
-
-        The size of C goes into ``unit`` or ``offset`` by powers of two, which is exact:
-        values are near 1 in any units.
-        """
+        """The criterion in the coordinates of one problem. The size of C goes into
+        ``unit`` or ``offset`` by powers of two, which is exact."""
         root, times = self.rows(at), 1 if self.per_output else at.times
         if self.kind == "det":
             units = power_of_two(np.abs(root).max(axis=1, keepdims=True))
@@ -248,11 +241,7 @@ class I(Criterion):  # noqa: E742 - the criterion's own name in the literature
 
 
 class G(I):
-    """Largest variance of a prediction over a region, in units of the noise.
-
-    Args:
-        region: as of ``I``.
-    """
+    """Largest variance of a prediction over a ``region`` as of ``I``."""
 
     name, says, of_each = "G", "largest variance", True
 
@@ -296,11 +285,7 @@ class Ds(_SubsetCriterion):
 
 
 class As(_SubsetCriterion):
-    """Sum of the variances of the parameters of interest; the others are nuisance.
-
-    Args:
-        parameters: their names or indices, at least one.
-    """
+    """Sum of the variances of the ``parameters`` of interest, as of ``Ds``."""
 
     name, kind, says = "As", "trace", "trace V"
 
@@ -315,9 +300,8 @@ def offered() -> list[str]:
     return [
         name
         for name, kind in CRITERIA.items()
-        if kind.of_parameters or not inspect.signature(kind).parameters
-        or kind.of_region
-    ]  # fmt: skip
+        if kind.of_parameters or kind.of_region or not signature(kind).parameters
+    ]
 
 
 def criterion_of(criterion: Any, region: Any, default: str) -> Criterion:
@@ -361,3 +345,135 @@ def positions(
     if len(set(places)) < len(places) or not places:
         raise ValueError(f"parameters must be names, each once, got {parameters!r}")
     return [int(at) for at in places]
+
+
+class ScenarioCriterion:
+    """A criterion over scenarios, of letters or an object, else the design's own."""
+
+    word: str
+    efficiency_name = "efficiency"
+    least: ClassVar[bool]  # the worst scenario counts
+    of_efficiency: bool = False
+    each: Criterion  # of the first scenario
+    kind: str  # of that
+
+    def __init__(self, criterion: Any = None) -> None:
+        if isinstance(criterion, ScenarioCriterion):
+            raise ValueError(
+                f"{type(self).__name__} needs a criterion of one scenario, got "
+                f"{type(criterion).__name__}"
+            )
+        self.criterion = criterion
+
+    def __repr__(self) -> str:
+        given = "" if self.criterion is None else repr(self.criterion)
+        return f"{type(self).__name__}({given})"
+
+    def within(self, each: Criterion) -> Self:
+        joined = copy.copy(self)
+        joined.each, joined.kind = each, each.kind
+        return joined
+
+    @property
+    def name(self) -> str:
+        """The name as it is written: "Mean(D)"."""
+        return f"{type(self).__name__}({self.each.name})"
+
+    @property
+    def says(self) -> str:
+        return f"{self.each.says}, {self.word}"
+
+    @property
+    def larger_is_better(self) -> bool:
+        return self.of_efficiency or self.each.larger_is_better
+
+    def efficiency(self, value: float, bound: float) -> float:
+        if self.of_efficiency:
+            return value / bound
+        return self.each.efficiency(value, bound)
+
+    def bettered(self, value: float, share: float) -> float:
+        if self.of_efficiency:
+            return min(1.0, value * (1.0 + share))
+        return self.each.bettered(value, share)
+
+    def enough(self, efficiency: float) -> tuple[float, float]:
+        """A bound of at most the first times the value, plus the second, proves it."""
+        if self.of_efficiency and self.kind == "det":
+            return 1.0, -float(np.log(efficiency))
+        slope, shift = self.each.enough(efficiency)
+        return slope, self.each.times * shift
+
+    def terms(
+        self, criteria: Sequence[Criterion], optima: Array | None
+    ) -> tuple[Array, Array]:
+        """(S,) scale and shift: ``scale phi + shift`` of a scenario is what is joined.
+
+        It is the reported value, of a trace its negative. Of efficiencies e against
+        ``optima`` (S,) it is log e (det), -1 / e (trace) or e (least): concave.
+        """
+        if self.kind == "det":
+            scale = np.array([float(one.times) for one in criteria])
+            shift = scale * [one.offset for one in criteria]
+            if optima is None:
+                return scale, shift
+            rows = scale * len(criteria[0].root)
+            return scale / rows, (shift - optima) / rows
+        units = np.array([one.unit for one in criteria])
+        if self.kind == "trace":
+            scale = units * criteria[0].times
+        else:
+            scale = 1.0 / np.maximum(units, 1e-320)
+        if not (np.isfinite(scale) & (scale > 0.0)).all():
+            raise ValueError(
+                f"criterion {self.name} in a scenario is out of range in double "
+                "precision; give the commands in other units"
+            )
+        return (scale if optima is None else scale / optima), np.zeros(len(scale))
+
+    def reported(self, joined: Array | float) -> Any:
+        """The value as the caller reads it, of what ``terms`` make."""
+        if not self.of_efficiency:
+            return -joined if self.kind == "trace" else joined
+        if self.kind == "det":
+            return np.exp(joined)
+        return -1.0 / np.asarray(joined) if self.kind == "trace" else joined
+
+
+class Mean(ScenarioCriterion):
+    """The weighted mean over the scenarios of a criterion."""
+
+    word, least = "mean", False
+
+
+class Worst(ScenarioCriterion):
+    """The criterion in the scenario where it is worst.
+
+    With ``efficiency`` scenarios are compared by the efficiency in each, relative to
+    its own optimum, or to a bound where that is not proven.
+    """
+
+    least = True
+
+    def __init__(self, criterion: Any = None, efficiency: bool = False) -> None:
+        super().__init__(criterion)
+        self.of_efficiency = bool(efficiency)
+
+    word = "worst"
+
+    @property
+    def name(self) -> str:
+        more = ", efficiency" if self.of_efficiency else ""
+        return f"Worst({self.each.name}{more})"
+
+    @property
+    def says(self) -> str:
+        """The criterion, in words."""
+        own = f"least {self.each.name}-efficiency"
+        return own if self.of_efficiency else super().says
+
+
+class Largest(Worst):
+    """G: the worst of the predictions, each of which stands for a scenario."""
+
+    word, efficiency_name, name, says = "", "G-efficiency", "G", "largest variance"

@@ -42,14 +42,12 @@ class Design:
             None where blocks are given.
         model: of ``jaxcal.models``; ``y = A u + b``, with as many outputs as inputs,
             when not given.
-        prior: a ``jaxcal.Prior`` of the model's parameters, its own default when not
-            given; of blocks a (p, p) precision, nothing when not given.
-        noise: a ``jaxcal.Noise``, or its standard deviation; when not given
-            ``model.default_noise()`` where the model has one (an arm), else of unit
-            variance.
-        measured: (N, n) commands measured already: their information is there, and
-            answers count the new ones. Of blocks (N, q, p), of scenarios
-            (S, N, q, p).
+        prior: a ``jaxcal.Prior`` of the model's parameters, else its own default; of
+            blocks a (p, p) precision, else nothing.
+        noise: a ``jaxcal.Noise``, or its standard deviation; else that of the model (an
+            arm), or of unit variance.
+        measured: (N, n) commands measured already: answers count the new ones. Of
+            blocks (N, q, p), of scenarios (S, N, q, p).
         available: (M,) bool or 0 and 1, True where a candidate may be chosen; all by
             default.
         required: (r,) candidates that must be among the chosen.
@@ -62,12 +60,11 @@ class Design:
         commands: (M, n) of the blocks, for travel between them and for tables.
         scenarios: if the nominal is uncertain, parameter values to average over: a
             whole number of draws from the prior (seeded), (S, p), or ``(parameters,
-            weights)``; of blocks (S, M, q, p) their weights (S,), of sum 1, equal when
-            not given. A criterion is then ``jaxcal.Mean("D")``, as letters alone are,
-            or ``jaxcal.Worst("D")``.
+            weights)``; of blocks their weights (S,), of sum 1, equal when not given. A
+            criterion is then ``jaxcal.Mean("D")``, as letters alone are, or
+            ``jaxcal.Worst("D")``.
         constraints: (A, b), A (r, M) or (M,) and b (r,) or a number: a selection must
-            have ``A w <= b``, w (M,) how often each candidate is chosen. A row of costs
-            and a budget; ones at some rows and "at most s of these".
+            have ``A w <= b``, w (M,) how often each candidate is chosen.
         names: (M,) names of the candidates, for the answers.
 
     Raises:
@@ -76,6 +73,9 @@ class Design:
     """
 
     candidate_set: CandidateSet  # what is asked about
+    available: NDArray[np.bool_]  # (M,) True where a candidate may be chosen
+    scenarios: Scenarios | None  # (S, p) parameters and (S,) weights, if any
+    axes: tuple[str, ...] | None  # (n,) of the inputs, the caller's own
 
     def __init__(
         self,
@@ -99,10 +99,12 @@ class Design:
             raise ValueError(f"give either candidates or blocks, got {got}")
         rows: Any = candidates if blocks is None else commands
         labels: Any = names
-        self.candidate_set = CandidateSet(
+        self.candidate_set = offer = CandidateSet(
             rows, model, prior, noise, measured, available, required, max_replicates,
             blocks, scenarios, labels, constraints=constraints,
         ).checked()  # fmt: skip
+        self.available, self.scenarios = offer.available, offer.scenarios
+        self.axes = offer.axes
 
     @classmethod
     def from_blocks(
@@ -116,21 +118,6 @@ class Design:
         """``Design(blocks=blocks, prior=prior, scenarios=weights, **rules)``."""
         return cls(blocks=blocks, prior=prior, scenarios=weights, **rules)
 
-    @property
-    def available(self) -> NDArray[np.bool_]:
-        """(M,) True where a candidate may be chosen."""
-        return self.candidate_set.available
-
-    @property
-    def scenarios(self) -> Scenarios | None:
-        """Parameters (S, p) and weights (S,); None: the nominal alone."""
-        return self.candidate_set.scenarios
-
-    @property
-    def axes(self) -> tuple[str, ...] | None:
-        """(n,) of the inputs, the caller's own."""
-        return self.candidate_set.axes
-
     def __repr__(self) -> str:
         model, usable = self.candidate_set.model, self.available
         what = "blocks" if model is None else type(model).__name__
@@ -139,8 +126,7 @@ class Design:
     def problem(
         self, k: int | None = None, criterion: Any = None, region: Any = None
     ) -> Problem:
-        """The problem of choosing k (the fewest that identify, if None), checked,
-        whitened."""
+        """The problem of choosing k, the fewest that identify if None."""
         return problem_of(self.candidate_set, k, criterion, region)
 
     def select(
@@ -177,11 +163,8 @@ class Design:
                 - checkpoint, decoding, num: of policy, a folder, else what ships; how
                   it chooses and how many it tries.
 
-        Returns:
-            The selection; never a singular one.
-
         Raises:
-            ValueError: naming the argument, the rule and the value.
+            ValueError: also where every selection is singular.
         """
         checked = checked_options(method, options)
         start = time.perf_counter()
@@ -206,8 +189,8 @@ class Design:
         Args:
             indices: (k,) the subset; repeated entries are replicates.
             criterion: as in ``select``.
-            reference: what ``bound`` and ``efficiency`` are relative to: "bound" (the
-                cheapest bound, computed when read) or "exact" (the optimum).
+            reference: of ``bound`` and ``efficiency``: "bound" (the cheapest bound,
+                computed when read) or "exact" (the optimum).
             time_limit: seconds for the optimum, 10 when not given.
 
         Raises:
@@ -218,10 +201,8 @@ class Design:
         start = time.perf_counter()
         subset = np.asarray(indices)
         if subset.ndim != 1 or subset.dtype.kind not in "iu" or not len(subset):
-            raise ValueError(
-                "indices must be a (k,) array of whole numbers, at least one, got "
-                f"shape {subset.shape} and dtype {subset.dtype}"
-            )
+            rule = "indices must be a (k,) array of whole numbers, at least one"
+            raise ValueError(f"{rule}, got {subset.dtype} of shape {subset.shape}")
         subset = subset.astype(np.int64)
         problem = _with_optima(self._problem_with(subset, criterion))
         if reference == "bound":
@@ -283,34 +264,21 @@ class Design:
                 f"criterion {problem.criterion.name} is {value} in double precision; "
                 "give the commands in other units"
             )
+        best = solution.alternatives or [(indices, value, log_det)]
         return Selection(
-            indices=indices,
-            value=value,
-            log_det=log_det,
-            method=solution.method or method,
-            proven=solution.proven,
-            seconds=time.perf_counter() - start,
-            problem=problem,
-            reason=solution.reason,
-            seed=solution.seed,
-            restarts=solution.restarts,
-            nodes=solution.nodes,
-            alternatives=tuple(Subset(*x) for x in solution.alternatives)
-            or (Subset(indices, value, log_det),),
-            known_bound=solution.bound,
-            names=self.candidate_set.names,
-            axes=self.axes,
-        )
+            indices, value, log_det, solution.method or method, solution.proven,
+            time.perf_counter() - start, problem, solution.reason, solution.seed,
+            solution.restarts, solution.nodes, tuple(Subset(*x) for x in best),
+            solution.bound, self.candidate_set.names, self.axes,
+        )  # fmt: skip
 
     def _why_singular(self, indices: Indices) -> str:
         """What choosing among these candidates alone would be refused for."""
+        usable, k = np.isin(np.arange(len(self.available)), indices), len(indices)
         alone = dataclasses.replace(
-            self.candidate_set,
-            available=np.isin(np.arange(len(self.available)), indices),
-            required=None,
-            max_replicates=len(indices),
+            self.candidate_set, available=usable, required=None, max_replicates=k,
             constraints=None,
-        )
+        )  # fmt: skip
         try:
             problem_of(alone, len(indices))
         except ValueError as error:
@@ -327,14 +295,12 @@ def _with_optima(problem: Problem) -> Problem:
 
 def _require_allowed(problem: Problem, indices: Indices, method: str) -> None:
     """Refuse what is no selection of this problem: the solver is wrong."""
+    count = len(problem.available)
     right = indices.shape == (problem.k,) and indices.dtype.kind in "iu"
-    if right and ((0 <= indices) & (indices < len(problem.available))).all():
-        counts = np.bincount(indices, minlength=len(problem.available))
+    if right := right and bool(((0 <= indices) & (indices < count)).all()):
+        counts = np.bincount(indices, minlength=count)
         right = bool(((problem.lower <= counts) & (counts <= problem.upper)).all())
-        right = right and problem.allows(indices)
-    else:
-        right = False
-    if not right:
+    if not right or not problem.allows(indices):
         raise RuntimeError(
             f"method {method!r} must return {problem.k} candidates within the bounds "
             f"lower and upper of its problem, got {indices.tolist()}"

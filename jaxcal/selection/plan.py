@@ -1,22 +1,18 @@
 """The number of measurements that a wanted accuracy needs, with a table.
 
-With noise of standard deviation sigma on an output, the fitted model predicts that
-output at z = [u, 1] with the standard error ``sigma sqrt(z.T G^-1 z)``, G = Z.T Z of
-the postures measured; likewise any model, z a row of its derivative and G the
-information in units of the noise. Two summaries over the region of interest: "G", the
-largest standard error anywhere in it, and "I", the root of the mean variance over it.
+With noise of standard deviation sigma on an output, the fitted model predicts it with
+the standard error ``sigma sqrt(z.T M^-1 z)``, z a row of its derivative, M the
+information of what is measured in units of the noise. Two summaries over the region of
+interest: "G", the largest standard error in it, and "I", the root of the mean variance.
 The standard errors of the parameters are those of a region of unit vectors.
 
-The best design of each K is looked for by exchange on the criterion itself, from the
-selection that exchange finds for D, the greedy one, the design of one measurement less
-plus its best addition, and random ones. What no design of K measurements beats: with
-weights w over the region and W = sum of w z z.T, the largest variance is at least the
-weighted mean trace(W M^-1), and that at least what the relaxation of branch and bound
-proves. For G the weights are those of the D-optimal measure of the region, which make
-the bound p / K where the region is the candidates and replicates are free (Kiefer and
-Wolfowitz 1960). The K returned is proven the smallest where the bound of K - 1 lies
-above the target. Sources: Atkinson, Donev and Tobias, Optimum Experimental Designs;
-Pukelsheim, Optimal Design of Experiments.
+The best design of each K is looked for by exchange on the criterion itself. What none
+of K measurements beats: with weights w over the region and W = sum of w z z.T, the
+largest variance is at least the weighted mean trace(W M^-1), and that at least what the
+relaxation of branch and bound proves. For G the weights are those of the D-optimal
+measure of the region, which make the bound p / K where the region is the candidates and
+replicates are free (Kiefer and Wolfowitz 1960). Source: Atkinson, Donev and Tobias,
+Optimum Experimental Designs.
 """
 
 from __future__ import annotations
@@ -34,7 +30,7 @@ from jaxcal.information.blocks import largest_rank
 from jaxcal.information.singular import significant
 from jaxcal.late import late
 from jaxcal.models.uncertainty import Noise
-from jaxcal.selection.criteria import I, positions
+from jaxcal.selection.criteria import I, Mean, positions
 from jaxcal.selection.exact.exact import relaxed
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import (
@@ -46,7 +42,6 @@ from jaxcal.selection.problem import (
     shares_regressor,
 )
 from jaxcal.selection.problem.problem import joined_problem
-from jaxcal.selection.problem.scenarios import Mean
 from jaxcal.selection.solvers import checked_seed
 
 if TYPE_CHECKING:
@@ -103,10 +98,8 @@ class Plan:
         return int((self.standard_error / self.accuracy).argmax())
 
     def worst(self, errors: Array) -> float:
-        """Largest of (m,) errors over their targets, times that of the hardest output.
-
-        Where the targets are equal, the largest error.
-        """
+        """Largest of (m,) errors over their targets, times that of the hardest output:
+        where the targets are equal, the largest error."""
         share = (errors / self.accuracy).max()
         return float(share * self.accuracy[self.hardest_output])
 
@@ -121,17 +114,13 @@ class Plan:
             what = f"standard error of parameter {self.names[worst]}"
         elif self.noise_std is not None:
             what += f", noise {self.noise_std[worst]:g}"
-        lines = [
-            f"{what}, target {self.accuracy[worst]:g}",
-            "   K  distinct  standard error      lower bound",
-        ]
+        lines = [f"{what}, target {self.accuracy[worst]:g}"]
+        lines.append("   K  distinct  standard error      lower bound")
         for row in self.rows:
+            error, least = map(self.worst, (row.standard_error, row.least_error))
             mark = " <-" if row.k == self.k else ""
-            lines.append(
-                f"{row.k:4d} {row.num_distinct:9d} "
-                f"{self.worst(row.standard_error):15.6g} "
-                f"{self.worst(row.least_error):16.6g}{mark}"
-            )
+            distinct = f"{row.k:4d} {row.num_distinct:9d}"
+            lines.append(f"{distinct} {error:15.6g} {least:16.6g}{mark}")
         proof = "proven" if self.smallest_proven else "not proven to be"
         return "\n".join([*lines, f"K = {self.k} is {proof} the smallest"])
 
@@ -215,19 +204,16 @@ class _Sizes:
 
     def bound(self, k: int) -> float:
         """No design of k has a smaller largest variance."""
-        if k in self._bounds:
-            return self._bounds[k]
         if k == self.problem.k:  # there is one design only
             every = np.repeat(np.arange(len(self.problem.blocks)), self.problem.upper)
-            bound = float(self.variances(every).max())
-        else:
+            return float(self.variances(every).max())
+        if k not in self._bounds:
             alone = [
                 dataclasses.replace(case.problem, k=k, criterion=I.of_rows(root))
                 for case, root in zip(self.cases, self._roots, strict=True)
             ]
-            bound = max(-relaxed(one, greedy_indices(one)) for one in alone)
-        self._bounds[k] = bound
-        return bound
+            self._bounds[k] = max(-relaxed(one, greedy_indices(one)) for one in alone)
+        return self._bounds[k]
 
     def variances(self, indices: Indices) -> Array:
         """(s,) the criterion of each output in the worst scenario; inf if singular."""
@@ -246,8 +232,7 @@ class _Sizes:
         return np.asarray(self.over(((points @ (right.T / singular)) ** 2).sum(2), 0))
 
     def best(self, k: int, previous: Indices | None) -> tuple[Indices, Array]:
-        """(k,) the best design found, sorted, from that of k - 1; its variances
-        (s,)."""
+        """(k,) the best design found, from that of k - 1; its variances (s,)."""
         problem = self.problem.of_size(k)
         best = exchange_indices(problem, _D_RESTARTS, self.seed)
         value = float(self.variances(best).max())
@@ -271,10 +256,8 @@ class _Sizes:
         return best, self.variances(best)
 
     def _exchanged(self, problem: Problem, start: Indices) -> tuple[Indices, float]:
-        """Swap one posture at a time, the best swap first, until none helps.
-
-        The required stay, one measurement of each; so does a singular start.
-        """
+        """Swap one posture at a time, the best swap first, until none helps; the
+        required stay, one measurement of each, and a singular start."""
         chosen = np.array(start)
         value = float(self.variances(chosen).max())
         while np.isfinite(value):
@@ -339,8 +322,8 @@ def _room(problem: Problem, indices: Indices) -> Indices:
 
 
 def _region_root(points: Array, how: str) -> Array:
-    """(r, p) root of W, of points (R, s, p) and weights of sum 1: for "I" equal ones,
-    for "G" by Titterington's steps w <- w (z.T W^-1 z) / p."""
+    """(r, p) root of W, of points (R, s, p) and weights: for "I" equal ones, for "G" by
+    Titterington's steps w <- w (z.T W^-1 z) / p."""
     rows = points.reshape(-1, points.shape[-1])
     weight = np.full(len(rows), 1.0 / len(rows))
     for _ in range(_ITERATIONS if how == "G" else 0):

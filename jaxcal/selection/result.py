@@ -1,7 +1,5 @@
-"""What every solver returns, and what it is worth in each scenario.
-
-An efficiency in a scenario is measured by the optimum of that scenario alone, which is
-proven or bounded within a share of a time limit: then it is at least what is said.
+"""What every solver returns, and what it is worth in each scenario, by the optimum of
+that scenario alone, which is proven or bounded within a share of a time limit.
 """
 
 from __future__ import annotations
@@ -53,13 +51,8 @@ class ScenarioTable:
         """The smallest efficiency."""
         return float(self.efficiencies.min())
 
-    @property
-    def mean(self) -> float:
-        """The weighted mean efficiency."""
-        return float(self.weights @ self.efficiencies)
-
-    def summary(self) -> list[str]:
-        """Two lines: this design, and the nominal's own."""
+    def __str__(self) -> str:
+        """This design, and the nominal's own."""
         count = f"{len(self.weights)}, efficiency against the optimum of each"
         if not self.proven.all():
             count += f", {int(self.proven.sum())} of them proven"
@@ -69,10 +62,7 @@ class ScenarioTable:
             if shares is not None:
                 least, mean = shares.min(), self.weights @ shares
                 lines.append(f"  {name:9}   least {least:.4f}, mean {mean:.4f}")
-        return lines
-
-    def __str__(self) -> str:
-        return "\n".join(self.summary())
+        return "\n".join(lines)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -115,11 +105,8 @@ class Selection:
 
     @cached_property
     def bound(self) -> float:
-        """Bound on the value of every allowed selection: upper, for A, As, I lower.
-
-        The optimum where the solver proved it or ``score`` was asked to, or where
-        k = n + 1 makes it cheap; otherwise the concave relaxation.
-        """
+        """Bound on the value of every allowed selection: upper, for A, As, I lower. The
+        optimum where it was proven or is cheap; otherwise the concave relaxation."""
         bound = self.known_bound
         if bound is None:
             bound = upper_bound(self.problem)
@@ -133,10 +120,8 @@ class Selection:
 
     @property
     def efficiency(self) -> float:
-        """Lower limit of the efficiency against the best selection, from ``bound``.
-
-        ``exp((value - bound) / s)`` for s parameters of interest (D, Ds), else a ratio.
-        """
+        """At least this efficiency, from ``bound``: ``exp((value - bound) / s)`` for s
+        parameters of interest (D, Ds), else a ratio."""
         return self.problem.criterion.efficiency(self.value, self.bound)
 
     @cached_property
@@ -158,10 +143,8 @@ class Selection:
 
     @cached_property
     def left_without(self) -> Array:
-        """(k,) det S without each of the chosen, as a share of det S; 0 is singular.
-
-        Of scenarios the least over them.
-        """
+        """(k,) det S without each of the chosen, as a share of det S; 0 is singular; of
+        scenarios the least."""
         members = self.problem.members
         shares = [_shares_without(member, self.indices) for member in members]
         return np.asarray(np.min(shares, axis=0))
@@ -199,11 +182,9 @@ class Selection:
         needed = np.flatnonzero(self.left_without == 0.0)
         if len(needed) == len(self.indices):
             return "singular, whichever measurement is lost"
-        names = [self.labels[i] for i in needed]
-        if len(names) > 1:
-            return f"singular without any one of {self._noun}s {', '.join(names)}"
-        if names:
-            return f"singular without {self._noun} {names[0]}"
+        if len(needed):
+            names = " or ".join(self.labels[i] for i in needed)
+            return f"singular without {self._noun} {names}"
         worst = int(self.left_without.argmin())
         share, name = self.left_without[worst], f"{self._noun} {self.labels[worst]}"
         return f"losing {name} costs most: {100 * share:.3g} % of det S remains"
@@ -234,7 +215,7 @@ class Selection:
             *self._table(),
             f"{self.problem.criterion.says:13} {self.value:.6g} ({self._limit()})",
             f"{share:13} {self.efficiency:.6f}" + ("" if self.proven else " or more"),
-            *(() if self.in_scenarios is None else self.in_scenarios.summary()),
+            *(() if self.in_scenarios is None else [str(self.in_scenarios)]),
             f"{'without one':13} {self._lost()}",
             f"time          {lasted(self.seconds)}{extra}",
         ]
@@ -274,32 +255,15 @@ def optima_of(problem: ScenarioProblem) -> tuple[Array, NDArray[np.bool_]]:
 def in_scenarios(problem: ScenarioProblem, indices: Indices) -> ScenarioTable:
     """A selection (k,) in each scenario."""
     optima, proven = optima_of(problem)
-    values = problem.scenario_values(indices[None])[0][:, 0]
+    values = problem.scenario_values(indices[None])[0]
     better = np.maximum if problem.criterion.each.larger_is_better else np.minimum
-    optima = better(optima, values)
-    nominal = nominal_efficiencies = None
+    optima = better(optima, values[:, 0])
+    nominal = of_nominal = None
     if problem.nominal is not None:
         nominal = _optimum(problem.nominal, _LIMIT / 4.0)[0]
-        nominal_efficiencies = _efficiencies(problem, nominal, optima)
+        nominal_values = problem.scenario_values(nominal[None])[0]
+        of_nominal = problem.efficiencies(nominal_values, optima)[:, 0].clip(0.0, 1.0)
+    shares = problem.efficiencies(values, optima)[:, 0].clip(0.0, 1.0)
     return ScenarioTable(
-        weights=problem.weights,
-        values=values,
-        optima=optima,
-        proven=proven,
-        efficiencies=_efficiencies(problem, indices, optima),
-        nominal_indices=nominal,
-        nominal_efficiencies=nominal_efficiencies,
+        problem.weights, values[:, 0], optima, proven, shares, nominal, of_nominal
     )
-
-
-def _efficiencies(problem: ScenarioProblem, indices: Indices, optima: Array) -> Array:
-    """(S,) of a selection; 0 where it is singular."""
-    values, log_dets = problem.scenario_values(indices[None])
-    return np.array(
-        [
-            member.criterion.efficiency(value, best) if np.isfinite(log_det) else 0.0
-            for member, value, log_det, best in zip(
-                problem.members, values[:, 0], log_dets[:, 0], optima, strict=True
-            )
-        ]
-    ).clip(0.0, 1.0)

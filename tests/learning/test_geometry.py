@@ -44,7 +44,7 @@ def test_of_many_candidates_those_of_largest_gain_are_looked_ahead_from(
     few = lookahead(jnp.asarray(y), True, jnp.asarray(active), 3)
     values = np.empty((4, 1100))
     given = np.ascontiguousarray(y.T, np.float64)
-    look_ahead(given, active, True, 3, False, None, values)
+    look_ahead(given, active, True, 3, False, values)
     for mine, theirs in zip(few, values, strict=True):
         np.testing.assert_allclose(mine, theirs, atol=1e-4)
     assert (np.asarray(few[1]) > -30.0).sum() == 512

@@ -13,8 +13,7 @@ from jaxcal.models import Affine
 from jaxcal.selection import exact_batch, exchange_batch, select
 from jaxcal.selection.exact import exact as exact_module
 from jaxcal.selection.exact.branch_and_bound import Scenario, branch_and_bound
-from jaxcal.selection.exact.exact import solve_exact, upper_bound
-from jaxcal.selection.exact.volume import largest_volume
+from jaxcal.selection.exact.exact import largest_volume, solve_exact, upper_bound
 from jaxcal.selection.exchange.exchange import exchange_indices
 
 

@@ -149,7 +149,7 @@ def test_the_look_ahead_is_greedy_choice_by_determinants(rng, spanned):
     active = np.arange(m) != 3
     y[:, ~active] = 0.0
     values = np.empty((4, m))
-    look_ahead(y, active, spanned, depth, False, None, values)
+    look_ahead(y, active, spanned, depth, False, values)
 
     def log_volume(subset):
         gram = y[:, subset].T @ y[:, subset] + spanned * np.eye(len(subset))
@@ -167,7 +167,7 @@ def test_the_look_ahead_is_greedy_choice_by_determinants(rng, spanned):
 def test_of_many_candidates_the_512_of_largest_gain_are_starts(rng):
     y = rng.normal(size=(4, 1100))
     values = np.empty((4, 1100))
-    look_ahead(y, np.ones(1100, bool), False, 2, False, None, values)
+    look_ahead(y, np.ones(1100, bool), False, 2, False, values)
     started = values[1] > -30.0
     assert started.sum() == 512
     square = (y**2).sum(axis=0)

@@ -168,7 +168,7 @@ def test_what_is_left_without_each_measurement_is_told(rng):
     rest = [np.delete(rows, i, axis=0) for i in range(4)]
     expected = [max(np.linalg.det(some.T @ some), 0.0) / whole for some in rest]
     np.testing.assert_allclose(selection.left_without, expected, atol=1e-12)
-    ends = "without one   singular without any one of candidates 0, 3\n"
+    ends = "without one   singular without candidate 0 or 3\n"
     assert ends in str(selection)
     fewest = jaxcal.select(rng.random((9, 3)))
     np.testing.assert_array_equal(fewest.left_without, 0.0)

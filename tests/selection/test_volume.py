@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.selection import select
-from jaxcal.selection.exact import volume
-from jaxcal.selection.exact.volume import Volume, largest_volume
+from jaxcal.selection.exact import exact
+from jaxcal.selection.exact.exact import Volume, largest_volume
 
 Array = np.ndarray
 
@@ -43,7 +43,7 @@ def prepared(
 ) -> Volume:
     """From a known volume, however few subsets there are."""
     with monkeypatch.context() as patch:
-        patch.setattr(volume, "_PREPARED", 0)
+        patch.setattr(exact, "_PREPARED", 0)
         return largest_volume(vectors, deadline)
 
 
@@ -131,7 +131,7 @@ def test_the_search_for_pairs_ends_on_the_clock(
     angles = np.random.default_rng(0).uniform(0, np.pi, 200_000)
     vectors = np.column_stack([np.cos(angles), np.sin(angles)])
     begun = time.perf_counter()
-    monkeypatch.setattr(volume, "_PREPARED", 10**12)
+    monkeypatch.setattr(exact, "_PREPARED", 10**12)
     found = largest_volume(vectors, Deadline(1.0))
     assert time.perf_counter() - begun < 5.0  # all pairs: 20 s
     assert not found.complete and found.bound >= found.size

@@ -20,9 +20,8 @@ from jaxcal import compiled
 from jaxcal.checks import Array, Indices
 from jaxcal.deadline import NEVER, Deadline
 from jaxcal.information.blocks import gram, largest_rank
-from jaxcal.selection.criteria import Criterion
+from jaxcal.selection.criteria import Criterion, ScenarioCriterion
 from jaxcal.selection.problem import Constraints
-from jaxcal.selection.problem.scenarios import ScenarioCriterion
 
 TOLERANCE = 1e-10  # of phi of "det"; of the others a share of it
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first
@@ -33,7 +32,7 @@ _FREE = 3e6  # node x M q p^2 spent on a proof although ``enough`` is reached: 1
 
 @dataclasses.dataclass(frozen=True)
 class BranchResult:
-    """The best selections within the counts, and how far they can be from optimal."""
+    """The best selections within the counts."""
 
     counts: Indices  # (found, M), best first
     values: Array  # (found,) phi
@@ -55,11 +54,10 @@ class Scenario(NamedTuple):
         useful = min(largest, _USEFUL.get(criterion.kind, np.inf))
         search = compiled.kernel("jaxcal.selection.exact.branch_kernel").Search(
             criterion.form, blocks, prior, root, start.sum(), largest_rank(blocks),
-            useful, *incumbents,
+            useful, incumbents, False, False,
         )  # fmt: skip
-        return _KernelSearch(
-            search, scale, shift, largest, blocks.size * blocks.shape[2]
-        )
+        work = blocks.size * blocks.shape[2]
+        return _KernelSearch(search, scale, shift, largest, work)
 
 
 class JointScenarios(NamedTuple):
@@ -71,13 +69,11 @@ class JointScenarios(NamedTuple):
     terms: tuple[Array, Array]  # (S,) scale and shift of phi
 
     def search(self, upper: Indices, start: Indices, incumbents: Any) -> _KernelSearch:
-        scenarios, criterion, weights, terms = self
+        scenarios, criterion, weights, (scale, shift) = self
         kernel = compiled.kernel("jaxcal.selection.exact.branch_kernel")
         near = [_near_one(*scenario, start, upper) for scenario in scenarios]
         roots, units, origins, tops = zip(*near, strict=True)
-        scale, shift = terms
-        shift = shift + scale * origins
-        scale = scale * units
+        shift, scale = shift + scale * origins, scale * units
         most = scale * tops + shift
         largest = float(most.min() if criterion.least else weights @ most)
         unit = 1.0
@@ -93,7 +89,7 @@ class JointScenarios(NamedTuple):
         members = [
             kernel.Search(
                 scenario.criterion.form, scenario.blocks, scenario.prior, root, k,
-                largest_rank(scenario.blocks), useful, *_incumbents(1, len(start)),
+                largest_rank(scenario.blocks), useful, _incumbents(1, len(start)),
                 True, packs,
             )
             for scenario, root in zip(scenarios, roots, strict=True)
@@ -101,7 +97,7 @@ class JointScenarios(NamedTuple):
         first = scenarios[0]
         search = kernel.JointSearch(
             first.criterion.form, first.blocks, first.prior, roots[0], k, 1, useful,
-            *incumbents,
+            incumbents, False, False,
         )  # fmt: skip
         search.join(members, weights, scale, shift, criterion.least)
         work = len(scenarios) * first.blocks.size * first.blocks.shape[2]
@@ -136,17 +132,38 @@ def branch_and_bound(
         enough: efficiency at which to stop, once the proof has had a fair try.
         root_only: stop at the bound of the relaxation.
     """
-    incumbents = _incumbents(best, len(start))
+    best_counts, best_values, order = incumbents = _incumbents(best, len(start))
     started = judged_by.search(upper, start, incumbents)
-    counts = np.array([lower, upper, start], dtype=np.float64)
-    begin = counts[2]
+    search, scale, shift, largest, work = started
+    begun = np.array([lower, upper, start], dtype=np.float64)
+    begin = begun[2]
     if rules is not None:
-        begin = _price(started.search, rules, counts, deadline.part(0.2))
-    good = (0.0, np.inf) if root_only else (0.0, -np.inf)
+        begin = _price(search, rules, begun, deadline.part(0.2))
+    good = (0.0, np.inf if root_only else -np.inf)  # slope and shift of what is enough
     if enough is not None:
-        slope, shift = judged_by.criterion.enough(enough)
-        good = slope, shift / started.scale
-    return _searched(started, incumbents, counts, begin, deadline, good, root_only)
+        slope, more = judged_by.criterion.enough(enough)
+        good = slope, more / scale
+    search.offer(begun, deadline.remaining_s)
+    nodes, bounds = np.empty((64, *begun.shape)), np.full(64, np.inf)
+    nodes[0] = *begun[:2], begin
+    widest = max(256, _MEMORY // nodes[0].nbytes)
+    tries = 1 if root_only else int(_FREE / work)
+    size, done, going = 1, 0, True
+    while size and going:
+        if size + 2 > len(bounds):
+            nodes = np.concatenate([nodes, np.empty_like(nodes)])
+            bounds = np.concatenate([bounds, np.full(len(bounds), np.inf)])
+        size, newly, going = search.run(
+            nodes, bounds, size, TOLERANCE, widest, max(1, tries - done),
+            deadline.remaining_s, *good,
+        )  # fmt: skip
+        done += newly
+    bound = min(bounds[:size].max(initial=best_values[0]), largest)
+    bound = bound if size else best_values[0]
+    reached = np.isfinite(best_values)
+    counts = best_counts[order[reached]].astype(np.int64)
+    values = scale * best_values[reached] + shift
+    return BranchResult(counts, values, float(scale * bound + shift), done, size == 0)
 
 
 def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) -> Array:
@@ -168,8 +185,8 @@ def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) ->
         value = search.relaxed(begun[0], begun[1], counts, deadline.remaining_s)
         return value, most - costs @ counts
 
-    prices, best, cheapest, cuts = np.zeros(len(most)), np.inf, np.zeros(len(most)), []
-    dearest = _DEAR
+    prices = cheapest = np.zeros(len(most))
+    best, cuts, dearest = np.inf, [], _DEAR
     for _ in range(_CUTS):
         value, slope = bound(prices)
         if value < best:
@@ -196,54 +213,8 @@ def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) ->
 
 def _incumbents(best: int, num_blocks: int) -> tuple[Array, Array, Indices]:
     """Room for the ``best`` selections: counts, values and their order."""
-    return (
-        np.zeros((best, num_blocks)),
-        np.full(best, -np.inf),
-        np.arange(best, dtype=np.intp),
-    )
-
-
-def _searched(
-    started: _KernelSearch,
-    incumbents: tuple[Array, Array, Indices],
-    begun: Array,
-    begin: Array,
-    deadline: Deadline,
-    good: tuple[float, float],
-    root_only: bool,
-) -> BranchResult:
-    """Branch from the whole problem until it is solved, or as far as is asked for.
-
-    ``begun`` (3, M): bounds of the counts, and a good selection; ``good``: enough is a
-    bound of at most the first times the best, plus the second.
-    """
-    search, scale, shift, largest, work = started
-    best_counts, best_values, order = incumbents
-    search.offer(*begun, deadline.remaining_s)
-    nodes, bounds = np.empty((64, *begun.shape)), np.full(64, np.inf)
-    nodes[0] = *begun[:2], begin
-    widest = max(256, _MEMORY // nodes[0].nbytes)
-    tries = 1 if root_only else int(_FREE / work)
-    size, done, going = 1, 0, True
-    while size and going:
-        if size + 2 > len(bounds):
-            nodes = np.concatenate([nodes, np.empty_like(nodes)])
-            bounds = np.concatenate([bounds, np.full(len(bounds), np.inf)])
-        size, more, going = search.run(
-            nodes, bounds, size, TOLERANCE, widest, max(1, tries - done),
-            deadline.remaining_s, *good,
-        )  # fmt: skip
-        done += more
-    bound = min(bounds[:size].max(initial=best_values[0]), largest)
-    bound = bound if size else best_values[0]
-    reached = np.isfinite(best_values)
-    return BranchResult(
-        best_counts[order[reached]].astype(np.int64),
-        scale * best_values[reached] + shift,
-        float(scale * bound + shift),
-        done,
-        size == 0,
-    )
+    order = np.arange(best, dtype=np.intp)
+    return np.zeros((best, num_blocks)), np.full(best, -np.inf), order
 
 
 def _near_one(

@@ -100,19 +100,7 @@ class Search:
     ``branch_kernel.pxd``."""
 
     def __init__(
-        self,
-        form,
-        blocks,
-        prior,
-        root,
-        k,
-        rank,
-        useful,
-        best_counts,
-        best_values,
-        order,
-        lent=False,
-        packs=False,
+        self, form, blocks, prior, root, k, rank, useful, incumbents, lent, packs
     ):
         # Arrays are C-contiguous float64; the best (best, M) and (best,) are written.
         # (A docstring here would be a global symbol of C, of which a module that holds
@@ -120,8 +108,8 @@ class Search:
         self.count, self.q, self.p = blocks.shape
         self.kind = _KINDS[form]
         self.k, self.rank, self.s = k, rank, len(root)
-        self.best_counts, self.best_values = best_counts, best_values
-        self.useful, self.order = useful, order
+        self.best_counts, self.best_values, self.order = incumbents
+        self.useful = useful
         self.most_moved = min(self.count, _FRACTIONAL + 2 * self.p + 4)
         self.lent, self.packs = lent, packs
         self.whole = np.empty(3 + 5 * self.p, dtype=np.intc)
@@ -281,8 +269,7 @@ class Search:
     def _evaluate(self, kind):
         """Value to climb by at P, N and M, -inf where M is singular; sets ``base``,
         which differs from it by rounding, and for E."""
-        p: cython.int = self.p
-        value: cython.double = 0.0
+        p, value = self.p, 0.0
         self.base = 0.0
         if kind != _RANK:
             value = factor(self.gram, self.inverse, self.vectors, p)
@@ -314,8 +301,7 @@ class Search:
         -log det G + trace(G M) - p bounds log det M whatever G is, and
         ``trace(Y M Y.T - 2 C Y.T)`` -trace(C W C.T) whatever Y is, with G = Y.T Y.
         """
-        total: cython.double = 0.0
-        size: cython.double = 0.0
+        total, size = 0.0, 0.0
         for a in range(self.p * self.p):
             part = self.gradient[a] * self.gram[a]
             total += part
@@ -345,8 +331,7 @@ class Search:
         total: cython.double = 0.0
         for a in range(p):
             length: cython.double = dot(reach + a * p, reach + a * p, p)
-            for b in range(p):
-                # |C y| = 1
+            for b in range(p):  # |C y| = 1
                 basis[a * p + b] *= 1.0 / sqrt(length) if length > 0.0 else 0.0
             apart = values[a] - values[0]
             slopes[a] = exp(-self.smoothing * apart) if apart > 0.0 else 1.0
@@ -356,25 +341,19 @@ class Search:
             slopes[a] /= total
             self.tail[a] = slopes[a]
             self.own[a] = -self.smoothing * slopes[a]
-            if slopes[a] > 0.0:
-                # y.T M y
+            if slopes[a] > 0.0:  # y.T M y
                 self.base += slopes[a] * dot(reach + a * p, basis + a * p, p)
         self.tail_weight = self.smoothing
         return values[0] - log(total) / self.smoothing  # (5)
 
     def _shared_out(self, kind):
         """Bound F at N in the metric of P, slopes and base; f of A is -mu / (1 + l)."""
-        p: cython.int = self.p
-        values = self.values
+        p, values = self.p, self.values
         multiply(False, False, p, p, p, self.half, self.rest, self.scaled)
         multiply(False, True, p, p, p, self.scaled, self.half, self.vectors)
         eigen(self.vectors, values, self.lapack, self.whole, p)
         multiply(False, False, p, p, p, self.vectors, self.half, self.basis)
-        kept: cython.int = 0
-        places: cython.int = self.places
-        rest: cython.double = 0.0
-        shares: cython.double = 0.0
-        logs: cython.double = 0.0
+        kept, places, rest, shares, logs = 0, self.places, 0.0, 0.0, 0.0
         for a in range(p):
             values[a] = max(values[a], 0.0)
             rest += values[a]
@@ -405,8 +384,7 @@ class Search:
 
     def _bends(self):
         """Fill the gradient of E or F, and the bend of the Hessian."""
-        p: cython.int = self.p
-        values, slopes = self.values, self.slopes
+        p, values, slopes = self.p, self.values, self.slopes
         for a in range(p):
             for b in range(a):
                 apart = values[a] - values[b]
@@ -444,8 +422,7 @@ class Search:
     def _weigh(self):
         """Fill ``weights`` and ``lines``: u and ``v.T inverse(H)``, by rows: ``C.T C``
         is the sum of u times the outer product of a row with itself."""
-        p: cython.int = self.p
-        s: cython.int = self.s
+        p, s = self.p, self.s
         multiply(False, True, s, p, p, self.root, self.half, self.reach)
         multiply(True, False, p, p, s, self.reach, self.reach, self.vectors)
         eigen(self.vectors, self.weights, self.lapack, self.whole, p)
@@ -480,11 +457,9 @@ class Search:
         the eigenvectors above mu lose by N, plus what F allows the t readings to take.
         At a whole selection several are best, and the largest serves its neighbours.
         """
-        p: cython.int = self.p
-        allowed = self.places - self.shares
+        p, allowed = self.p, self.places - self.shares
         for d in range(p):
-            line = self.lines + (p - 1 - d) * p
-            taken: cython.double = 1.0
+            line, taken = self.lines + (p - 1 - d) * p, 1.0
             for a in range(p):
                 taken -= line[a] * dot(self.inverse + a * p, line, p)
             allowed -= taken
@@ -502,8 +477,7 @@ class Search:
     def _hessian(self, kind, m):
         """Fill ``curvature`` (m, m): minus the Hessian over the counts of ``which``."""
         q, p = self.q, self.p
-        wide: cython.int = m * q
-        x, y, out = self.crossed, self.bent, self.curvature
+        wide, x, y, out = m * q, self.crossed, self.bent, self.curvature
         for i in range(m):
             block = self.blocks + self.which[i] * q * p
             copy(self.picked + i * q * p, block, q * p)
@@ -527,8 +501,7 @@ class Search:
                     for s in range(q):
                         if kind == DET:
                             total += y[at + s] * y[at + s]  # (2)
-                        elif kind == SUBSET:
-                            # (3)
+                        elif kind == SUBSET:  # (3)
                             total += (2.0 * y[at + s] - x[at + s]) * x[at + s]
                         else:
                             total += 2.0 * x[at + s] * y[at + s]  # (4)
@@ -537,8 +510,7 @@ class Search:
     def _spectral_hessian(self, m):
         """Minus the Hessian of E or F, of blocks turned into the basis."""
         q, p = self.q, self.p
-        size: cython.int = p * (p + 1) // 2
-        at: cython.Py_ssize_t = 0
+        size, at = p * (p + 1) // 2, 0
         for i in range(m):
             self.ends[i] = 0.0
             for a in range(p):
@@ -563,8 +535,7 @@ class Search:
 
     def _leverages(self):
         """``trace(B_i G B_i.T)`` where the count is not fixed."""
-        size: cython.int = self.q * self.p
-        done: cython.Py_ssize_t = 0
+        size, done = self.q * self.p, 0
         if self.packs:
             self._pack(self.gradient, self.packed, 2.0)
             for o in range(self.opened):
@@ -629,8 +600,7 @@ class Search:
 
     def _working_set(self, low, high, c):
         """Counts to move: the fractional ones and some of those that should move."""
-        extra: cython.int = 2 * self.p + 4
-        fractional: cython.int = 0
+        extra, fractional = 2 * self.p + 4, 0
         count: cython.int = 0
         largest: cython.double = 0.0
         for o in range(self.opened):
@@ -657,8 +627,7 @@ class Search:
             if count > extra:
                 break
             least *= 0.5
-        size: cython.int = 0
-        room: cython.int = fractional + extra
+        size, room = 0, fractional + extra
         for o in range(self.opened):
             i = self.open[o]
             inside: cython.bint = fractional > 0 and low[i] < c[i] and c[i] < high[i]
@@ -708,8 +677,7 @@ class Search:
             row = f * size
             right[f] = (right[f] - dot(face + row, right, f)) * face[row + f]
             ones[f] = (ones[f] - dot(face + row, ones, f)) * face[row + f]
-        total: cython.double = 0.0
-        weight: cython.double = 0.0
+        total, weight = 0.0, 0.0
         for b in range(size):
             f = size - 1 - b
             row = f * size
@@ -741,16 +709,13 @@ class Search:
                 if self.side[i] == 0:
                     self.free[size] = i
                     size += 1
-            cut: cython.double = 0.0
-            hit: cython.Py_ssize_t = -1
+            cut, hit = 0.0, -1
             if size:
-                cut = self._solve(m, size)
-                part: cython.double = 1.0
+                cut, part = self._solve(m, size), 1.0
                 for f in range(size):
                     i, step = self.free[f], self.right[f]
-                    room = (self.most[i] if step > 0.0 else self.least[i]) - self.move[
-                        i
-                    ]
+                    room = self.most[i] if step > 0.0 else self.least[i]
+                    room -= self.move[i]
                     if fabs(step) * part > fabs(room):
                         part, hit = fabs(room / step), f
                 for f in range(size if size > 1 else 0):
@@ -765,10 +730,7 @@ class Search:
                 self.move[i] = self.most[i] if self.side[i] > 0 else self.least[i]
                 continue
             # At rest on this face: let go of the count that pulls most from its bound.
-            pull: cython.double = 1e-9 * fabs(cut)
-            best: cython.Py_ssize_t = -1
-            other: cython.Py_ssize_t = -1
-            highest: cython.double = -INFINITY
+            pull, best, other, highest = 1e-9 * fabs(cut), -1, -1, -INFINITY
             lowest: cython.double = INFINITY
             for i in range(m):
                 wish = self.side[i] * (cut - self.slope[i])
@@ -795,8 +757,7 @@ class Search:
 
     def _spread(self, low, high, c):
         """Share what the lower bounds leave in proportion to the room of each count."""
-        room: cython.double = 0.0
-        fixed: cython.double = 0.0
+        room, fixed = 0.0, 0.0
         for i in range(self.count):
             room += high[i] - low[i]
             fixed += low[i]
@@ -813,9 +774,7 @@ class Search:
         if not value > -INFINITY:
             return value
         sharpest: cython.double = INFINITY
-        bound: cython.double = INFINITY
-        after: cython.double = value
-        tunes = _TUNES
+        bound, after, tunes = INFINITY, value, _TUNES
         for step in range(_MAX_STEPS):
             self.now = kind
             self._leverages()
@@ -872,10 +831,7 @@ class Search:
 
     def _step(self, kind, low, high, c, value):
         """phi after a step of the working set, which is halved while it falls short."""
-        m = self._working_set(low, high, c)
-        after: cython.double = value
-        promised: cython.double = 0.0
-        part: cython.double = 1.0
+        m, after, promised, part = self._working_set(low, high, c), value, 0.0, 1.0
         for i in range(m):
             j = self.which[i]
             self.before[i], self.slope[i] = c[j], self.leverage[j]
@@ -930,18 +886,13 @@ class Search:
         best[place], self.order[place] = value, row
         copy(address(self.best_counts[row, 0]), counts, self.count)
 
-    def offer(
-        self,
-        low: cython.double[::1],
-        high: cython.double[::1],
-        counts: cython.double[::1],
-        seconds: cython.double,
-    ):
-        """Offer a selection (M,) and, where several are wanted, all one swap away from
-        it."""
+    def offer(self, begun: cython.double[:, ::1], seconds: cython.double):
+        """Offer a selection (3, M), its bounds first, and, if several are wanted, all
+        one swap away from it."""
         self.watch = begin(seconds)
-        chosen = address(counts[0])
-        self._offer(chosen)
+        low, high = address(begun[0, 0]), address(begun[1, 0])
+        counts = address(begun[2, 0])
+        self._offer(counts)
         i: cython.Py_ssize_t
         j: cython.Py_ssize_t
         for i in range(self.count if self.best_values.shape[0] > 1 else 0):
@@ -953,7 +904,7 @@ class Search:
                         return
                     counts[i] -= 1.0
                     counts[j] += 1.0
-                    self._offer(chosen)
+                    self._offer(counts)
                     counts[i] += 1.0
                     counts[j] -= 1.0
 
@@ -985,8 +936,7 @@ class Search:
         the inverse of the curvature among counts of one sum."""
         m: cython.int = 0
         largest: cython.double = 1e-300
-        total: cython.double = 0.0
-        lower = self.curvature
+        total, lower = 0.0, self.curvature
         for o in range(self.opened):
             i = self.open[o]
             self.wish[i] = 0.0
@@ -1002,8 +952,7 @@ class Search:
         cholesky(lower, lower, m, _RIDGE * largest)
         invert_lower(lower, m)
         for r in range(m):
-            row = lower + r * m
-            across: cython.double = 0.0
+            row, across = lower + r * m, 0.0
             for f in range(r + 1):
                 across += row[f]
             for f in range(r + 1):
@@ -1027,9 +976,7 @@ class Search:
         bound[0] = self._relax(self._kind_of(low), low, high, c, goal, share)
         if bound[0] <= goal:
             return -1
-        room = self.linear - goal
-        total_low: cython.double = 0.0
-        total_high: cython.double = 0.0
+        room, total_low, total_high = self.linear - goal, 0.0, 0.0
         for i in range(self.count):
             slope = self.leverage[i] - self.cut
             if low[i] < high[i] and room < fabs(slope) * (high[i] - low[i]):
@@ -1045,9 +992,7 @@ class Search:
         settled: cython.bint = total_low == self.k or total_high == self.k
         if settled:
             copy(c, low if total_low == self.k else high, self.count)
-        whole: cython.bint = True
-        branch: cython.Py_ssize_t = -1
-        score: cython.double = -1.0
+        whole, branch, score = True, -1, -1.0
         if not settled:
             self._stiffen(c)
         total: cython.double = 0.0
@@ -1190,19 +1135,16 @@ class JointSearch(Search):
 
     def _evaluate(self, kind):
         lowest: cython.double = INFINITY
-        value: cython.double = 0.0
-        total: cython.double = 0.0
+        value, total = 0.0, 0.0
         for s in range(self.addresses.shape[0]):
             cast(Search, self.members[s]).smoothing = self.smoothing
-            value = cast(Search, self.members[s])._evaluate(
-                cast(Search, self.members[s]).now
-            )
+            now = cast(Search, self.members[s]).now
+            value = cast(Search, self.members[s])._evaluate(now)
             if not value > -INFINITY:
                 return -INFINITY
+            base = cast(Search, self.members[s]).base
             self.worth[s] = self.scale[s] * value + self.shift[s]
-            self.bases[s] = (
-                self.scale[s] * cast(Search, self.members[s]).base + self.shift[s]
-            )
+            self.bases[s] = self.scale[s] * base + self.shift[s]
             lowest = min(lowest, self.worth[s])
         for s in range(self.addresses.shape[0]):
             share: cython.double = self.weights_of[s]
@@ -1211,8 +1153,7 @@ class JointSearch(Search):
                 share = exp(-self.smoothing * apart) if apart > 0.0 else 1.0
             self.mixture[s] = share
             total += share
-        value = lowest - log(total) / self.smoothing
-        seen: cython.double = 0.0
+        value, seen = lowest - log(total) / self.smoothing, 0.0
         for s in range(self.addresses.shape[0]):
             self.mixture[s] /= total
             if self.mixture[s] < _UNSEEN:
@@ -1252,10 +1193,7 @@ class JointSearch(Search):
         many: cython.Py_ssize_t = 0
         for s in range(count):
             many += self.mixture[s] * count > _FAINT
-        stride: cython.Py_ssize_t = max(1, many // _SAMPLED)
-        at: cython.Py_ssize_t = self.turn
-        whole: cython.double = 0.0
-        sampled: cython.double = 0.0
+        stride, at, whole, sampled = max(1, many // _SAMPLED), self.turn, 0.0, 0.0
         for s in range(count):
             share: cython.double = self.mixture[s] * self.scale[s]
             self.sample[s] = False
@@ -1269,9 +1207,8 @@ class JointSearch(Search):
         for s in range(count):
             share = self.mixture[s] * self.scale[s]
             if self.sample[s]:
-                cast(Search, self.members[s])._hessian(
-                    cast(Search, self.members[s]).now, m
-                )
+                now = cast(Search, self.members[s]).now
+                cast(Search, self.members[s])._hessian(now, m)
                 for a in range(m * m):
                     out[a] += share * whole / sampled * one[a]
             if not self.least_counts or not share > 0.0:

@@ -1,31 +1,35 @@
 """The proven optimum, by whichever proof is cheaper.
 
 k = n + 1 affine postures: the absolute determinant is convex in each posture, so only
-vertices of the convex hull matter, and ``jaxcal.selection.exact.volume`` finds the
-largest volume. Everything else (more postures, blocks, priors, other criteria, many
-runners-up) goes to branch and bound, started from the exchange.
+vertices of the convex hull matter, and ``largest_volume`` finds the best. Everything
+else goes to branch and bound, started from the exchange.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from jaxcal.checks import Indices
+from jaxcal import compiled
+from jaxcal.checks import Array, Indices
 from jaxcal.deadline import NEVER, Deadline
-from jaxcal.selection.exact.volume import largest_volume
+from jaxcal.selection.exact.branch_and_bound import (
+    BranchResult,
+    JointScenarios,
+    Scenario,
+    branch_and_bound,
+)
+from jaxcal.selection.exact.volume_kernel import descend
 from jaxcal.selection.exchange.exchange import (
     default_restarts,
     exchange_indices,
     greedy_indices,
+    rules_of,
 )
 from jaxcal.selection.problem import Problem, Solution
-
-if TYPE_CHECKING:
-    from jaxcal.selection.exact.branch_and_bound import BranchResult
 
 STARTING_RESTARTS = 30  # of the exchange: the search does the rest
 _SEARCHED = 0.85  # of the time, before the exchange goes on where nothing is proven
@@ -37,6 +41,10 @@ TOLERATED = 1e-9  # share by which rounding may change what is called proven
 
 _CHEAP = 5_000_000  # subsets: the largest volume is found within milliseconds
 _LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
+_PREPARED = 100_000_000  # subsets from which a known volume is worth its time
+_STEPS = 5  # towards the D-optimal weights
+_STARTS = 4  # random ones of climbs to a known volume, beside a greedy one, which
+_SHARE = 0.2  # counts this share of mean vectors for those not chosen yet
 
 
 def solve(
@@ -62,20 +70,18 @@ def solve_auto(
     time_limit: float | None,
     least_efficiency: float,
 ) -> Solution:
-    """The solver "auto": the cheapest way to an answer that is proven good enough.
+    """The solver "auto": the search ends once its bound proves ``least_efficiency``.
 
-    The search ends as soon as its bound proves ``least_efficiency``. The answer's
     ``method`` is "exact" where it ran to its end or its time limit, else "exchange".
     """
     limit = time_limit or (TIME_LIMIT if problem.rank_one else _BLOCKS_LIMIT)
     deadline = Deadline(limit)
     restarts = restarts or _starts(problem)
     solution = solve_exact(problem, 1, deadline, restarts, seed, least_efficiency)
-    assert solution.value is not None and solution.bound is not None
     started: dict[str, Any] = {"seed": seed, "restarts": restarts}
     if solution.reason:  # rounding
         return dataclasses.replace(solution, method="exact", **started)
-    share = problem.criterion.efficiency(solution.value, solution.bound)
+    share = _share(problem, solution)
     method, reason = "exact", "the exact search proved this optimum"
     if not solution.proven:
         name = problem.criterion.efficiency_name
@@ -86,6 +92,12 @@ def solve_auto(
             method, reason = "exchange", f"the bound proves {at_least}, and "
         reason += f"{least_efficiency:g} was asked for"
     return dataclasses.replace(solution, method=method, reason=reason, **started)
+
+
+def _share(problem: Problem, solution: Solution) -> float:
+    """The efficiency that the bound of a solution leaves."""
+    assert solution.value is not None and solution.bound is not None
+    return float(problem.criterion.efficiency(solution.value, solution.bound))
 
 
 def _starts(problem: Problem) -> int:
@@ -103,11 +115,9 @@ def solve_exact(
     seed: int = 0,
     enough: float | None = None,
 ) -> Solution:
-    """The ``best`` selections, or the best found by ``deadline`` and a true bound.
-
-    They are the ``alternatives``, best first; none of them is singular. ``enough`` is
-    the efficiency in (0, 1] at which to stop, unless the proof is cheap.
-    """
+    """The ``best`` selections, none singular, as ``alternatives``, or the best found by
+    ``deadline`` and a true bound. ``enough`` is the efficiency in (0, 1] at which to
+    stop, unless the proof is cheap."""
     if best == 1 and problem.simplex:
         pool, cheap = _pool(problem)
         if enough and not cheap:
@@ -115,19 +125,15 @@ def solve_exact(
             begun = np.sort(exchange_indices(problem, restarts, seed, part))
             least = relaxed(problem, begun, deadline)
             relaxation = _solution_of(problem, [begun], best, least, 1)
-            value, bound = relaxation.value, relaxation.bound
-            assert value is not None and bound is not None
-            if problem.criterion.efficiency(value, bound) >= enough:
+            if _share(problem, relaxation) >= enough:
                 return relaxation
         return _enumerate(problem, pool, deadline)
     # Half of the time: a bound takes time as well.
     start = exchange_indices(problem, restarts, seed, deadline.part(0.5))
     keep, first = _groups(problem, merge=best == 1)
     counts = np.bincount(start, minlength=len(problem.blocks))
-    rules = [numbers[keep] for numbers in (problem.lower, problem.upper, counts)]
-    if len(first) < len(keep):
-        rules = [np.add.reduceat(numbers, first) for numbers in rules]
-    low, high, begun = rules
+    rules = (problem.lower, problem.upper, counts)
+    low, high, begun = (np.add.reduceat(numbers[keep], first) for numbers in rules)
     more = default_restarts(problem)
     time = deadline.part(_SEARCHED) if more > restarts else deadline
     searched = _branched(
@@ -167,12 +173,6 @@ def _branched(
     problem: Problem, keep: Indices, *rules: Any, **options: Any
 ) -> BranchResult:
     """Branch and bound over the candidates ``keep``, in all scenarios."""
-    from jaxcal.selection.exact.branch_and_bound import (
-        JointScenarios,
-        Scenario,
-        branch_and_bound,
-    )
-
     members = [
         Scenario(member.blocks[keep], member.prior, member.criterion)
         for member in problem.members
@@ -237,13 +237,83 @@ def _enumerate(problem: Problem, pool: Indices, deadline: Deadline) -> Solution:
     return _solution_of(problem, [subset, greedy], 1, bound, volume.examined)
 
 
+@dataclasses.dataclass(frozen=True)
+class Volume:
+    """The largest volume found."""
+
+    subset: Indices  # (q,) sorted
+    size: float  # |det|
+    examined: int  # nodes of the search
+    complete: bool  # False when the deadline passed first
+    bound: float  # no subset has a larger |det|; ``size`` where complete
+
+
+def largest_volume(vectors: Array, deadline: Deadline = NEVER) -> Volume:
+    """The q of (h, q) vectors with the largest |det|, to a share of 1e-10."""
+    h, q = vectors.shape
+    unit = float(np.abs(vectors).max(initial=0.0)) ** q
+    if q == 0 or unit == 0.0:
+        return Volume(np.arange(q), unit, 1, True, unit)
+    vectors = vectors / np.abs(vectors).max()
+    if q == 1:
+        longest = np.abs(vectors[:, 0]).argmax(axis=0, keepdims=True)
+        return Volume(longest, unit, h, True, unit)
+    vectors, triangle = np.linalg.qr(vectors)
+    unit *= float(np.prod(np.abs(np.diag(triangle))))
+    subset, largest, kept = np.arange(q), np.zeros(1), np.arange(h)
+    if math.comb(h, q) > _PREPARED:
+        subset = _climbed(vectors)
+        # Of equal vectors one is enough: two of them span no volume.
+        kept = np.unique(np.round(vectors, 13), axis=0, return_index=True)[1]
+        vectors, shrink = _evened(vectors, kept)
+        unit *= shrink
+        largest[0] = abs(np.linalg.det(vectors[subset]))
+    lengths = np.linalg.norm(vectors[kept], axis=1)
+    order = np.argsort(-lengths, kind="stable")
+    kept, lengths = kept[order], lengths[order]  # the longest first
+    points = np.empty((q - 1, len(kept), q))
+    index, place = np.empty(points.shape[:2], dtype=np.int64), np.zeros(q - 1, np.int64)
+    points[0], index[0] = vectors[kept], kept
+    time = deadline.remaining_s
+    complete, nodes = descend(points, index, place, subset, largest, time)
+    size = bound = float(largest[0])
+    if not complete:  # of the vectors that come first
+        begun = max(0, int(place[0]) - 1)
+        bound = max(bound, float(np.prod(lengths[begun : begun + q])))
+    return Volume(np.sort(subset), unit * size, nodes, complete, unit * bound)
+
+
+def _climbed(vectors: Array) -> Indices:
+    """(q,) vectors of large volume by exchange: its square is their det S."""
+    kernel = compiled.kernel("jaxcal.selection.exchange.exchange_kernel")
+    q, none = vectors.shape[1], np.zeros(0, dtype=np.int64)
+    blocks = np.ascontiguousarray(vectors[:, None])
+    nothing, unit, once = np.zeros((q, q)), np.eye(q), np.ones(len(blocks), np.intp)
+    climber = kernel.Climber(
+        "det", blocks, nothing, unit, once, none, q, 0, *rules_of(None, len(blocks))
+    )
+    chosen, phi = climber.climb(none, _SHARE, 1, math.inf)
+    return np.asarray(climber.random_climbs(_STARTS, chosen, phi, math.inf)[0])
+
+
+def _evened(vectors: Array, kept: Indices) -> tuple[Array, float]:
+    """The vectors in a metric where bounds, products of lengths, are sharp, and its
+    unit: near that of the D-optimal weights, by a few of Titterington's steps."""
+    q = vectors.shape[1]
+    weights = np.full(len(kept), 1.0 / len(kept))
+    for _ in range(_STEPS):
+        rows = np.sqrt(weights)[:, None] * vectors[kept]
+        triangle = np.linalg.qr(rows)[1]
+        even = np.linalg.solve(triangle.T, vectors.T).T
+        weights *= (even[kept] ** 2).sum(axis=1) / q
+    return even, float(np.prod(np.abs(np.diag(triangle))))
+
+
 def _solution_of(
     problem: Problem, subsets: list[Indices], best: int, phi: float | None, nodes: int
 ) -> Solution:
-    """Values in the caller's unit, singular subsets left out, best first.
-
-    ``phi`` is a bound on it from above; None where the first is proven.
-    """
+    """Values in the caller's unit, singular subsets left out, best first; ``phi``: an
+    upper bound on it, None where the first is proven."""
     chosen, criterion = np.array(subsets), problem.criterion
     value, log_det = problem.values(chosen)
     order = np.argsort(-value if criterion.larger_is_better else value, kind="stable")
@@ -255,17 +325,10 @@ def _solution_of(
             f"{chosen[0].tolist()}, is singular"
         )
     subsets, worth = list(chosen[order]), value[order].tolist()
+    log_dets = log_det[order].tolist()
     bound, proven, reason = _proof(problem, subsets[0], worth[0], phi)
-    return Solution(
-        indices=subsets[0],
-        value=worth[0],
-        log_det=float(log_det[order[0]]),
-        bound=bound,
-        proven=proven,
-        nodes=nodes,
-        alternatives=tuple(zip(subsets, worth, log_det[order].tolist(), strict=True)),
-        reason=reason,
-    )
+    listed = tuple(zip(subsets, worth, log_dets, strict=True))
+    return Solution(*listed[0], bound, proven, nodes, listed, reason=reason)
 
 
 def _proof(
@@ -276,7 +339,7 @@ def _proof(
     if phi is not None:
         better = max if criterion.larger_is_better else min
         bound = better(bound, float(criterion.reported(phi)))
-    unsure = problem.uncertainty(indices)
+    unsure, reason = problem.uncertainty(indices), ""
     off = float(getattr(problem.model, "resolution", 0.0))  # 0: exact derivatives
     if off > _ROUGH:
         unsure = min(2.0 * off, 1.0)
@@ -285,19 +348,17 @@ def _proof(
         )
     elif unsure <= TOLERATED:
         return bound, phi is None, ""
-    else:
+    elif phi is None:
         reason = (
             "not proven in double precision: the search is complete, but rounding may "
             f"change the variances by {unsure:.1g} (relative)"
-        ) * (phi is None)
+        )
     return criterion.bettered(bound, unsure), False, reason
 
 
 def _groups(problem: Problem, merge: bool) -> tuple[Indices, Indices]:
-    """Available candidates (N,), and where in them each of G groups begins (G,).
-
-    Equal ones are a group where ``merge``: fewer branches.
-    """
+    """Available candidates (N,), and where in them each of G groups begins (G,): equal
+    ones are a group where ``merge``."""
     keep = np.flatnonzero(problem.available)
     if merge:
         raw = [member.raw[keep].reshape(len(keep), -1) for member in problem.members]

@@ -1,4 +1,4 @@
-"""Compiled depth-first search for the largest volumes; see ``volume.py``.
+"""Compiled depth-first search for the largest volumes; see ``exact.py``.
 
 A node has chosen s of the q vectors. What the others still add is their part outside
 the span of the chosen, held as coordinates in the q - s dimensions left over (one
@@ -140,15 +140,13 @@ def _open(points, index, size, volume, depth, c, reached, room, order):
 
 def _longest_first(room, order, count):
     """Sort the first ``count`` of ``order[0]`` by length, by merging runs."""
-    key = room.shape[1] - 1
-    width: cython.Py_ssize_t = 1
+    key, width = room.shape[1] - 1, 1
     while width < count:
         begin_of: cython.Py_ssize_t = 0
         while begin_of < count:
             middle = min(begin_of + width, count)
             end = min(begin_of + 2 * width, count)
-            i: cython.Py_ssize_t = begin_of
-            j: cython.Py_ssize_t = middle
+            i, j = begin_of, middle
             for k in range(begin_of, end):
                 if j >= end or (
                     i < middle and room[order[0, i], key] >= room[order[0, j], key]

@@ -1,13 +1,9 @@
 """Greedy selection, and Fedorov exchange with restarts: no proof, in milliseconds.
 
 Each chosen candidate in turn is swapped for the one that raises the criterion most,
-until no swap helps. The first starts are greedy selections, the others random ones.
-Source: Fedorov, Theory of Optimal Experiments, 1972; Cook and Nachtsheim 1980 for one
-candidate at a time.
-
-E, the smallest eigenvalue, is climbed from local optima of A: the sum of the variances
-is at most p times the largest, and climbs from where the smallest eigenvalue stands
-still because two are equal.
+until no swap helps. The first starts are greedy selections, the others random ones; E,
+the smallest eigenvalue, is climbed from local optima of A. Source: Fedorov, Theory of
+Optimal Experiments, 1972; Cook and Nachtsheim 1980 for one candidate at a time.
 """
 
 from __future__ import annotations
@@ -60,11 +56,9 @@ def solve_greedy(problem: Problem) -> Solution:
 def greedy_indices(problem: Problem) -> Indices:
     """(k,) candidates in the order picked, the required ones first.
 
-    Gains count a share of what the candidates not chosen yet will give, in the
-    coordinates where all candidates together say as much of every direction: the best
-    of several shares, the last a small ridge, and of D's textbook, a small ridge in
-    numbers near 1. Swaps mend a singular selection. For E the gain is that in the sum
-    of the variances, which is at most p times and at least once the largest: an
+    Gains count a share of what the candidates not chosen yet will give: the best of
+    several shares, the last a small ridge, and of D's textbook, a small ridge in
+    numbers near 1. Swaps mend a singular selection. For E the gain is that of A: an
     incomplete selection has no least eigenvalue to raise.
     """
     climbs, best, phi = Climbs(problem, 0), problem.required, -np.inf
@@ -112,11 +106,9 @@ def _textbook(problem: Problem, raw: Array) -> Indices:
 
 
 def default_restarts(problem: Problem) -> int:
-    """Starts that found the proven optimum of nearly all small problems tried.
-
-    Of 12,000 distinct selections (4, 8 or 12 of 50, three inputs) 200 missed none;
-    replicates leave more local optima. Large problems of blocks get fewer: 10 to 15 ms.
-    """
+    """Starts that found the proven optimum of nearly all small problems tried: 200
+    missed none of 12,000 selections (4, 8 or 12 of 50, three inputs). Large problems of
+    blocks get fewer: 10 to 15 ms."""
     most = 200 if np.max(problem.max_replicates) == 1 else 600
     if problem.rank_one:
         return most
@@ -205,8 +197,7 @@ class Climbs:
 
     def best_least(self, problem: Problem, restarts: int) -> tuple[Indices, float]:
         """The best local optimum of E, and E: from local optima of A, the best first,
-        which come closer where parameters are many, and from random selections as
-        often."""
+        and from random selections as often."""
         many = (restarts + 1) // 2
         work = problem.k * problem.num_regressors**3
         most = int(min(max(_CLIMBS / work, 1), many))

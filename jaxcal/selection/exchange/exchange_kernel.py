@@ -459,8 +459,7 @@ class Climber:
 
     def _climb(self, least):
         """Swap each chosen for its best replacement until none helps; phi, or E."""
-        k = self.k
-        value: cython.double = 0.0
+        k, value = self.k, 0.0
         if least:
             value = self._least_of_chosen()
         else:
@@ -724,15 +723,13 @@ class Climber:
         for m in range(self.parts):
             multiply(False, False, q, p, p, address(self.blocks[out, 0, 0]),
                      self.now + m * p * p, self.tall + 2 * m * q * p)  # fmt: skip
+            grown = self.grown + (2 * g + m) * self.size + e
             for a in range(q * q):
-                self.at_out[m * q * q + a] = self.grown[
-                    (2 * g + m) * self.size + a * WIDE + e
-                ]
+                self.at_out[m * q * q + a] = grown[a * WIDE]
 
     def _addition(self):
         """The candidate of the largest gain alone, any where no gain is a number."""
-        best: cython.Py_ssize_t = -1
-        most: cython.double = -INFINITY
+        best, most = -1, -INFINITY
         for c in range(self.groups):
             alone = self.alone + c * WIDE
             j = _best_of(alone, self.closed + c * WIDE, most)
@@ -746,8 +743,7 @@ class Climber:
 
     def _replacement(self, out, value, rise):
         """The candidate that raises phi most in the place of ``out``; -1: none."""
-        q = self.q
-        taken: cython.double = 0.0
+        q, taken = self.q, 0.0
         self._take_out(out)
         for r in range(q):
             taken += self.at_out[r * q + r] / q
@@ -816,8 +812,7 @@ class Climber:
                 g = c
         if not self.tops[2 * g] > least:
             return -1
-        bound = self.bounds + g * WIDE
-        e: cython.Py_ssize_t = 0
+        bound, e = self.bounds + g * WIDE, 0
         while bound[e] != self.tops[2 * g]:
             e += 1
         bound[e] = -INFINITY
@@ -963,8 +958,7 @@ class JointClimber(Climber):
 
     def _best(self, swaps, most):
         """Which candidate gives the largest joined phi above ``most``; -1: none."""
-        best: cython.Py_ssize_t = -1
-        total = address(self.total[0])
+        best, total = -1, address(self.total[0])
         for c in range(self.groups):
             self._totals(c, swaps)
             j = _best_of(total, self.closed + c * WIDE, most)
@@ -1026,11 +1020,8 @@ class JointClimber(Climber):
         for s in range(0 if self.least else self.addresses.shape[0]):
             total += self.weights[s] * self.ahead[s, e]
         for s in range(self.addresses.shape[0]):
-            gram, rest = (
-                cast(Climber, self.members[s]).gram,
-                cast(Climber, self.members[s]).rest,
-            )
-            copy(gram, rest, self.p * self.p)
+            gram = cast(Climber, self.members[s]).gram
+            copy(gram, cast(Climber, self.members[s]).rest, self.p * self.p)
             cast(Climber, self.members[s])._add(e)
             value = cast(Climber, self.members[s])._least(False)
             if not value > -INFINITY:

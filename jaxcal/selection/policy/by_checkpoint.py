@@ -31,10 +31,8 @@ Chooser = Callable[[Sequence[Problem], str, int, int], Indices]
 
 
 def load_policy(checkpoint: str | pathlib.Path | None = None) -> Chooser:
-    """The newest policy of a weights file or a run's folder, or (None) that which
-    ships.
-
-    Read again only where its files have changed.
+    """The newest policy of a weights file or a run's folder, or (None) the shipped one;
+    read again only where its files have changed.
 
     Raises:
         ValueError: it is missing, damaged, or made by another version.
@@ -101,26 +99,20 @@ class _ThroughJax:
         for begin in range(0, len(problems), size):
             part = list(problems[begin : begin + size])
             filled = part + part[-1:] * (size - len(part))
+            sets = [(_in_unit_range(x), x.available, x.required) for x in filled]
+            seeds = [(seed, b) for b in range(begin, begin + size)]
             indices = scorer.choose(
-                self._policy.network,
-                self._policy.params,
-                np.stack([_in_unit_range(problem) for problem in filled]),
-                np.stack([problem.available for problem in filled]),
-                np.stack([problem.required for problem in filled]),
-                k=problems[0].k,
-                seeds=[(seed, b) for b in range(begin, begin + size)],
-                decoding=decoding,
-                num=tries,
-            )
+                self._policy.network, self._policy.params,
+                *map(np.stack, zip(*sets, strict=True)),
+                k=problems[0].k, seeds=seeds, decoding=decoding, num=tries,
+            )  # fmt: skip
             chosen.append(indices[: len(part)])
         return np.concatenate(chosen)
 
 
 def _in_unit_range(problem: Problem) -> NDArray[np.float32]:
     """(M, n) candidates on [0, 1], where such networks are trained; 0 where masked.
-
-    Sets in [0, 1] stay as they are; others are mapped axis by axis.
-    """
+    Sets in [0, 1] stay as they are; others are mapped axis by axis."""
     assert problem.candidates is not None  # blocks are refused before
     usable = problem.candidates[problem.available]
     low, high = usable.min(axis=0), usable.max(axis=0)
@@ -141,11 +133,8 @@ def select_batch(
     seed: int = 0,
     checkpoint: str | pathlib.Path | None = None,
 ) -> Indices:
-    """Choose k postures for every candidate set of a batch.
-
-    What is chosen from a set does not depend on the other sets, nor on the number of
-    cores or devices. (The last two postures are the best pair; which of them is named
-    first, rounding may decide.)
+    """(B, k) distinct postures of each candidate set, required ones first, then in the
+    order of choice; what is chosen from a set does not depend on the other sets.
 
     Args:
         candidates: (B, M, n) commands, none of the sets in one plane.
@@ -154,18 +143,12 @@ def select_batch(
         required: (B, r) candidates that must be chosen; the policy goes on from them.
         decoding: "greedy": the likeliest at every step, one pass; "samples": the best
             of ``num`` sampled passes; "first": the best of the ``num`` likeliest first
-            picks, each completed greedily; "exchange": greedy, then Fedorov exchange
-            from there.
-        num: passes of "samples" and "first".
-        seed: of "samples"; set b draws from ``numpy.random.default_rng((seed, b))``.
+            picks, each completed greedily; "exchange": greedy, then Fedorov exchange.
+        num, seed: passes of "samples" and "first"; of "samples".
         checkpoint: see ``load_policy``.
 
-    Returns:
-        (B, k) distinct indices, required ones first, then in the order of choice.
-
     Raises:
-        ValueError: naming the argument, the rule and the value; or what is wrong with
-            the checkpoint.
+        ValueError: also says what is wrong with the checkpoint.
     """
     problems = make_problems(candidates, k, available=available, required=required)
     return choose(problems, decoding, num, seed, checkpoint)

@@ -117,29 +117,21 @@ class CompactScorer:
         """(E, M) scores of the choice after ``count``; lowest where not free."""
         x, h = memory
         p, k = x.shape[1], chosen.shape[1]
-        remaining = k - count
+        remaining, made = k - count, chosen[:, :count].copy()
         exact = remaining <= self._unlearned
         only = exact and best_only
-        description = self._described(
-            x, chosen[:, :count].copy(), free, k, remaining, only
-        )
+        description = self._described(x, made, free, k, remaining, only)
         if exact:
             return np.where(free, _SHARP * description.ahead, -np.inf)
-        episode = np.arange(len(h))[:, None]
-        mean = h[episode, chosen[:, :count]].sum(axis=1) / np.float32(max(count, 1))
-        progress = [
-            remaining == 1,
-            remaining == 2,
-            remaining == 3,
-            1 / remaining,
-            count / p,
-        ]
-        progress += [min(remaining / p, 3.0), k > p]
+        mean = h[np.arange(len(h))[:, None], made].sum(axis=1) / np.float32(
+            max(count, 1)
+        )
+        progress = [remaining == 1, remaining == 2, remaining == 3, 1 / remaining]
+        progress += [count / p, min(remaining / p, 3.0), k > p]
         scalars = np.tile(np.array(progress, np.float32), (len(h), 1))
         state = np.concatenate([mean, scalars], axis=1)
-        g = self._dense(
-            "join", np.concatenate([h, description.features], axis=2), state
-        )
+        each = np.concatenate([h, description.features], axis=2)
+        g = self._dense("join", each, state)
         g *= description.active[..., None]
         for name in self._decoder:
             g = self._round(name, g, description)

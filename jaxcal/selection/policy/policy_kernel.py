@@ -58,9 +58,7 @@ def describe(x, chosen, active, k, depth, best_only, features, moments, ahead):
     with cython.nogil:
         for b in range(vectors.shape[0]):
             _conditional(vectors[b], made[b], active_bytes[b], all_of, y, work[0])
-            _look_ahead(
-                y, active_bytes[b], spanned, far, only, None, values, work, weights
-            )
+            _look_ahead(y, active_bytes[b], spanned, far, only, values, work, weights)
             _behind_best(values)
             behind[b] = values[3]
             if not only:
@@ -154,7 +152,7 @@ def _conditional(x, chosen, active, k, y, inner):
             y[c, j] *= active[j]
 
 
-def look_ahead(y, active, spanned, depth, best_only, factors, values):
+def look_ahead(y, active, spanned, depth, best_only, values):
     """Log of the factor by which the determinant grows over 1, 2, 3 and all choices,
     the first of them a given candidate and the others greedy.
 
@@ -163,21 +161,16 @@ def look_ahead(y, active, spanned, depth, best_only, factors, values):
     more than 1,024 candidates only the 512 of largest gain are looked ahead from.
 
     Args:
-        y: (p, M) vectors of the candidates given what was chosen, 0 where not active.
-        active: (M,) bool.
-        spanned: True where choosing i multiplies the determinant by ``1 + |y_i|^2``,
-            False where by ``|y_i|^2``.
+        y, active: (p, M) vectors given what was chosen, 0 where not active; (M,) bool.
+        spanned: choosing i multiplies the determinant by ``1 + |y_i|^2``; if False by
+            ``|y_i|^2``.
         depth: choices to look at, the start included; at least 1.
         best_only: skip the starts that cannot lead furthest: gains only fall.
-        factors: (M, M), at most 1, what a move from each to each multiplies gains by
-            (the toll of its time); None where moves cost nothing.
         values: (4, M) written: after ``min(d, depth)`` choices for d = 1, 2, 3 and
-            ``depth``; -30 (with factors ``-inf``) where not active, and after the first
-            where skipped.
+            ``depth``; -30 where not active, and after the first where skipped.
     """
     vectors: cython.double[:, ::1] = y
     active_bytes: cython.uchar[::1] = active.view(np.uint8)
-    tolls: cython.double[:, ::1] = factors
     to: cython.double[:, ::1] = values
     work: cython.double[:, ::1] = np.empty((len(y) + depth + 2, len(active)))
     factor: cython.double[::1] = np.empty(len(y) + depth)
@@ -185,13 +178,12 @@ def look_ahead(y, active, spanned, depth, best_only, factors, values):
     ahead: cython.Py_ssize_t = depth
     only: cython.bint = best_only
     with cython.nogil:
-        _look_ahead(vectors, active_bytes, grows, ahead, only, tolls, to, work, factor)
+        _look_ahead(vectors, active_bytes, grows, ahead, only, to, work, factor)
 
 
-def _look_ahead(y, active, spanned, depth, best_only, factors, values, work, weights):
+def _look_ahead(y, active, spanned, depth, best_only, values, work, weights):
     """``look_ahead``, with room (p + depth + 2, M) and (p + depth,)."""
     p, m = y.shape[0], y.shape[1]
-    priced: cython.bint = factors is not None
     base = 1.0 if spanned else 0.0
     square = work[p + depth]
     gains = work[p + depth + 1]  # of every candidate, after choices from a start
@@ -201,7 +193,7 @@ def _look_ahead(y, active, spanned, depth, best_only, factors, values, work, wei
     for c in range(p):
         for j in range(m):
             square[j] += y[c, j] * y[c, j]
-    values[:, :] = -INFINITY if priced else _LOWEST
+    values[:, :] = _LOWEST
     largest: cython.double = 0.0
     for j in range(m):
         if active[j]:
@@ -235,20 +227,10 @@ def _look_ahead(y, active, spanned, depth, best_only, factors, values, work, wei
             for j in range(m):
                 gains[j] -= row[j] * row[j]
                 gain = max(gain, gains[j])
-            if not priced:
-                newest = 0
-                while newest < m - 1 and gains[newest] != gain:
-                    newest += 1
-                reached += log(max(base + gain, _LEAST_GAIN))
-            else:
-                here = newest
-                most: cython.double = -1.0
-                for j in range(m):
-                    grown = max(base + gains[j], _LEAST_GAIN) * factors[here, j]
-                    if gains[j] > -0.5 and grown > most:  # -1 where taken
-                        most = grown
-                        newest = j
-                reached += log(most)
+            newest = 0
+            while newest < m - 1 and gains[newest] != gain:
+                newest += 1
+            reached += log(max(base + gain, _LEAST_GAIN))
             if d < 3:
                 values[d, i] = reached
         for d in range(min(depth, 3), 4):
@@ -264,12 +246,8 @@ def _combine(weights, rows, count):
     out[:] = 0.0
     done: cython.Py_ssize_t = 0
     while done + 4 <= count:
-        w0, w1, w2, w3 = (
-            weights[done],
-            weights[done + 1],
-            weights[done + 2],
-            weights[done + 3],
-        )
+        w0, w1 = weights[done], weights[done + 1]
+        w2, w3 = weights[done + 2], weights[done + 3]
         for j in range(m):
             out[j] += (
                 w0 * rows[done, j]

@@ -2,7 +2,7 @@
 
 from jaxcal.selection.problem.assembly import make_problems, problem_of
 from jaxcal.selection.problem.blocks import Blocks, blocks_of, shares_regressor
-from jaxcal.selection.problem.candidate_set import CandidateSet
+from jaxcal.selection.problem.candidate_set import CandidateSet, Scenarios
 from jaxcal.selection.problem.problem import (
     Constraints,
     Problem,
@@ -10,7 +10,6 @@ from jaxcal.selection.problem.problem import (
     Solution,
     log_dets,
 )
-from jaxcal.selection.problem.scenarios import Scenarios
 
 __all__ = [
     "Blocks",

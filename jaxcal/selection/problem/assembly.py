@@ -1,8 +1,4 @@
-"""The problem of a question to a candidate set, checked and whitened.
-
-``problem_of`` makes it out of the set's information blocks; scenarios are problems of
-their own, joined. ``make_problems`` makes a batch of the affine model's.
-"""
+"""The problem of a question to a candidate set, checked and whitened."""
 
 from __future__ import annotations
 
@@ -22,7 +18,16 @@ from jaxcal.information.blocks import (
 )
 from jaxcal.information.singular import SINGULAR, directions_in_words, require_excited
 from jaxcal.models.affine import Affine
-from jaxcal.selection.criteria import CRITERIA, Coordinates, Criterion, G, criterion_of
+from jaxcal.selection.criteria import (
+    CRITERIA,
+    Coordinates,
+    Criterion,
+    G,
+    Largest,
+    Mean,
+    ScenarioCriterion,
+    criterion_of,
+)
 from jaxcal.selection.problem.blocks import blocks_of
 from jaxcal.selection.problem.candidate_set import (
     CandidateSet,
@@ -34,7 +39,6 @@ from jaxcal.selection.problem.candidate_set import (
     usable_numbers,
 )
 from jaxcal.selection.problem.problem import Problem, joined_problem, scenario_problem
-from jaxcal.selection.problem.scenarios import Largest, Mean, ScenarioCriterion
 
 _LARGEST = 3e7  # numbers of all predictions' problems: 240 MB
 
@@ -87,12 +91,10 @@ def _problem_of_one(
     if where is None and criterion.of_region:
         where = blocks.predicted()
     region = None if where is None else blocks.at("region", where, readings=False)
-    rest: dict[str, Any] = {
-        "names": blocks.names,
-        "times": blocks.times,
-        "region": region,
-    }
-    return _checked_problem(offer, raw, root, criterion, k, **rest)
+    names, times = blocks.names, blocks.times
+    return _checked_problem(
+        offer, raw, root, criterion, k, names=names, times=times, region=region
+    )
 
 
 def _of_largest(problems: list[Problem]) -> Problem:
@@ -132,7 +134,9 @@ def make_problems(
     array = filled("candidates", candidates, "B", "M", "n")
     mask = check_available(available, array.shape[:2])
     array = usable_numbers("candidates", array, mask)
-    flatten_rounding(rounding_of(candidates), array[:, :, None], mask, bias=True)
+    spacing = rounding_of(candidates)
+    for one, usable in zip(array, mask, strict=True):
+        flatten_rounding(spacing, one[:, None], usable, bias=True)
     array.flags.writeable = False  # and so of every set
     m = array.shape[2] if num_outputs is None else num_outputs
     model = Affine(array.shape[2], whole_number("num_outputs", m, 1))
@@ -150,9 +154,9 @@ def make_problems(
             array[b], model, available=mask[b], max_replicates=max_replicates,
             required=None if forced is None else forced[b],
         )  # fmt: skip
-        rest: dict[str, Any] = {"white": white[b], "times": m}
+        rest = offer, raw[b], root, criterion, k
         try:
-            problems.append(_checked_problem(offer, raw[b], root, criterion, k, **rest))
+            problems.append(_checked_problem(*rest, white=white[b], times=m))
         except ValueError as error:
             raise ValueError(f"in set {b}: {error}") from None
     return problems
@@ -192,8 +196,7 @@ def _checked_problem(
     forced = _checked_required(offer.required, available, k)
     computed = bool(names) and offer.model is not None
     if white is None:
-        sets = raw[None], available[None]
-        white = whiten(*sets, root, computed=computed)[0]
+        white = whiten(raw[None], available[None], root, computed=computed)[0]
     if white is None:
         if not names and candidates is not None:
             names = (*axis_names("names", None, "u", candidates.shape[1]), "the bias")

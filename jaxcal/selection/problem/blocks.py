@@ -1,8 +1,7 @@
 """Information blocks of candidates, and of anything else that a question is about.
 
 What one measurement says is a block ``B`` (q, p) in units of the noise: it adds
-``B.T @ B`` to the information. ``blocks_of`` has those of a candidate set: blocks that
-no parameter changes, else derivatives at the mean of the prior or in a scenario.
+``B.T @ B`` to the information.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""``CandidateSet``: what may be measured, what is known and the rules, checked.
-
-``jaxcal.Design`` holds one; ``assembly`` makes the problem of a question out of it.
-"""
+"""``CandidateSet``: what may be measured, what is known and the rules, checked."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ import copy
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,7 +27,6 @@ from jaxcal.models.model import Model, as_model
 from jaxcal.models.predictions import answered
 from jaxcal.models.uncertainty import Prior, as_noise
 from jaxcal.selection.problem.problem import checked_constraints
-from jaxcal.selection.problem.scenarios import Scenarios, checked_weights, scenarios_of
 from jaxcal.tables import (
     COMMANDS,
     header_of,
@@ -43,12 +39,66 @@ from jaxcal.tables import (
 _FILLED = ", none of them 0"
 _ROUNDED = 4.0  # units in the last place that short sums of rounded numbers are off by
 _NUMBERS = 2**21  # of 8 bytes; beyond 32 MiB glibc no longer follows
+_SUM = 1e-6  # by which weights may miss a sum of 1
+
+
+class Scenarios(NamedTuple):
+    """Parameters and weights."""
+
+    parameters: Array | None  # (S, p) of the model; None where blocks hold them
+    weights: Array  # (S,) positive, of sum 1
+
+
+def scenarios_of(scenarios: Any, model: Model, prior: Prior | None) -> Scenarios:
+    """Scenarios of a number of draws from the prior, parameters (S, p), or
+    ``(parameters, weights)``."""
+    weights = None
+    if isinstance(scenarios, tuple):
+        if len(scenarios) != 2:
+            rule = "a number, parameters (S, p), or (parameters, weights)"
+            got = f"a tuple of {len(scenarios)}"
+            raise ValueError(f"scenarios must be {rule}, got {got}")
+        scenarios, weights = scenarios
+    elif np.ndim(scenarios) == 0:
+        scenarios = _drawn(whole_number("scenarios", scenarios, 1), model, prior)
+    rule = f", {len(model.names)} parameters of the model a row"
+    parameters = array_of("scenarios", scenarios, "S", len(model.names), rule=rule)
+    if not len(parameters):
+        raise ValueError("scenarios must hold at least one row of parameters, got none")
+    return Scenarios(parameters, checked_weights(weights, len(parameters)))
+
+
+def _drawn(count: int, model: Model, prior: Prior | None) -> Array:
+    """(S, p) draws from the prior; what it says nothing of stays at its mean."""
+    resolved = (model.default_prior() if prior is None else prior).resolve(model)
+    precision = np.where(resolved.free, np.diagonal(resolved.precision), 0.0)
+    drawn = precision > 0.0
+    if not drawn.any():
+        raise ValueError(
+            "a number of scenarios needs a prior with finite std; it is missing for "
+            f"{', '.join(map(str, model.names))}. Give prior=jaxcal.Prior(...), or the "
+            "parameters (S, p)"
+        )
+    std = np.where(drawn, 1.0 / np.sqrt(np.where(drawn, precision, 1.0)), 0.0)
+    normal = np.random.default_rng(0).standard_normal((count, len(std)))
+    return np.asarray(resolved.mean + std * normal)
+
+
+def checked_weights(weights: ArrayLike | None, count: int) -> Array:
+    """(S,) positive weights of sum 1; equal ones when not given."""
+    if weights is None:
+        return np.full(count, 1.0 / count)
+    checked = array_of("weights", weights, count, rule=", one for each scenario")
+    require_none(~(checked > 0.0), checked, "weights must be positive")
+    total = float(checked.sum())
+    if abs(total - 1.0) > _SUM:
+        raise ValueError(f"weights must sum to 1, got a sum of {total:.6g}")
+    return checked / total
 
 
 @dataclasses.dataclass(eq=False, repr=False)
 class CandidateSet:
-    """Candidates or blocks with the rules, as ``Design`` takes them, then
-    ``checked``."""
+    """Candidates or blocks with the rules, as ``Design`` takes them."""
 
     candidates: Any  # (M, n) commands in the caller's unit, finite; None: blocks alone
     model: Any = None  # a Model; None where blocks are given
@@ -130,10 +180,9 @@ class CandidateSet:
         if self.scenarios is not None:
             self.scenarios = scenarios_of(self.scenarios, model, self.prior)
         if model.multiplicity:  # which answers everywhere, by the commands themselves
-            measured: Any = self.measured
-            rows = measured[None, :, None] if np.ndim(measured) == 2 else None
-            mask = self.available[None]
-            flatten_rounding(spacing, array[None, :, None], mask, rows, bias=True)
+            rows: Any = self.measured
+            rows = rows[:, None] if np.ndim(rows) == 2 else None
+            flatten_rounding(spacing, array[:, None], self.available, rows, bias=True)
         else:
             self._leave_unanswered(model)
         self.candidates.flags.writeable = False
@@ -189,11 +238,12 @@ class CandidateSet:
                     "measured must have shape (S, N, q, p), blocks of every scenario, "
                     f"got {self.measured.shape}"
                 )
-        by_set, rows = np.moveaxis(array, 1, 0) if joined else array[None], None
-        if self.measured is not None:
-            rows = self.measured if joined else self.measured[None]
-        usable = np.broadcast_to(self.available, by_set.shape[:2])
-        flatten_rounding(spacing, by_set, usable, rows)
+        if joined:
+            for s in range(array.shape[1]):
+                rows = None if self.measured is None else self.measured[s]
+                flatten_rounding(spacing, array[:, s], self.available, rows)
+        else:
+            flatten_rounding(spacing, array, self.available, self.measured)
 
     def by_scenario(self) -> list[CandidateSet]:
         """The candidates in each scenario alone; where there are none, as they are."""
@@ -257,12 +307,9 @@ def filled(name: str, values: ArrayLike, *letters: str) -> Array:
 
 @functools.cache
 def _keep_freed_pages() -> None:
-    """Let glibc's malloc keep the pages of freed arrays for the next problem.
-
-    It returns the top of its heap beyond twice the largest array freed so far, and the
-    next problem waits for those pages again: .3 of .7 ms with blocks (2000, 3, 6). An
-    array of 16 MiB, freed and never written, raises that limit.
-    """
+    """Let glibc's malloc keep the pages of freed arrays for the next problem: an array
+    of 16 MiB, freed and never written, raises the limit beyond which it returns them.
+    Saves .3 of .7 ms with blocks (2000, 3, 6)."""
     np.empty(_NUMBERS)
 
 
@@ -288,7 +335,7 @@ def rounding_of(values: ArrayLike) -> float:
 
 def flatten_rounding(
     spacing: float,
-    candidates: Array,
+    blocks: Array,
     usable: Mask,
     measured: Array | None = None,
     *,
@@ -300,41 +347,34 @@ def flatten_rounding(
 
     Args:
         spacing: of the caller's numbers, see ``rounding_of``; 0: nothing is done.
-        candidates: (S, M, q, p) of S sets; ``usable`` (S, M): which of them count.
-        measured: (S, N, q, p) put into the plane with them.
+        blocks: (M, q, p), of which the ``usable`` (M,) count.
+        measured: (N, q, p) put into the plane with them.
         bias: a column of ones stands beside them, so the plane need not pass through 0.
     """
-    if not spacing:
+    if not spacing or not usable.any():
         return
-    blocks, counted = candidates, usable
-    if measured is not None and measured.shape[2:] == candidates.shape[2:]:
-        blocks = np.concatenate([candidates, measured], axis=1)
-        always = np.ones(measured.shape[:2], dtype=np.bool_)
-        counted = np.concatenate([usable, always], axis=1)
-    counts = counted[..., None, None]
-    blocks = np.where(counts, blocks, 0.0)
-    scale = _sizes(blocks, (1, 3))
-    scale = scale * _sizes(blocks / scale, (1, 2))
-    unit = blocks / scale
-    middle = np.zeros((len(unit), 1, *unit.shape[2:]))
-    if bias:
-        number = np.maximum(counts.sum(axis=1, keepdims=True), 1)
-        middle = unit.sum(axis=1, keepdims=True) / number
-    rows = np.where(counts, unit - middle, 0.0).reshape(len(unit), -1, unit.shape[3])
+    counted, count = blocks[usable], int(usable.sum())
+    if measured is not None and measured.shape[1:] == blocks.shape[1:]:
+        counted = np.concatenate([counted, measured])
+    scale = _sizes(counted, (0, 2))
+    scale = scale * _sizes(counted / scale, (0, 1))
+    unit = counted / scale
+    middle = unit.mean(axis=0) if bias else 0.0
+    rows = (unit - middle).reshape(-1, unit.shape[2])
     left, size, right = np.linalg.svd(rows, full_matrices=False)
-    real = size > _ROUNDED * spacing * np.sqrt(rows[0].size)
-    num = candidates.shape[1]
-    for n in np.flatnonzero(~real.all(axis=1)):
-        flat = (left[n] * np.where(real[n], size[n], 0.0)) @ right[n]
-        flat = (flat.reshape(unit.shape[1:]) + middle[n]) * scale[n]
-        candidates[n][usable[n]] = flat[:num][usable[n]]
-        if measured is not None and len(flat) > num:
-            measured[n] = flat[num:]
+    real = size > _ROUNDED * spacing * np.sqrt(rows.size)
+    if real.all():
+        return
+    flat = (left * np.where(real, size, 0.0)) @ right
+    flat = (flat.reshape(unit.shape) + middle) * scale
+    blocks[usable] = flat[:count]
+    if measured is not None and len(flat) > count:
+        measured[:] = flat[count:]
 
 
 def _sizes(blocks: Array, axes: tuple[int, int]) -> Array:
     """The largest of each reading or column, 1 where all are zero."""
-    largest = np.abs(blocks).max(axis=axes, initial=0.0, keepdims=True)
+    largest = np.abs(blocks).max(axis=axes, keepdims=True)
     return np.where(largest > 0.0, largest, 1.0)
 
 

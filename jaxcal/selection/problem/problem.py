@@ -2,13 +2,12 @@
 
 Solvers read whitened information blocks: candidate i adds ``B_i.T @ B_i`` to the
 prior's precision, and with everything available measured at once the sum is the
-identity (see ``jaxcal.information.blocks``). A solver that reads nothing else picks
-the same candidates in pulses, degrees or [0, 1]. The criterion is carried into the same
-coordinates. Postures of the affine model are blocks [u, 1] that count once per output.
+identity: they pick the same candidates in pulses, degrees or [0, 1]. Postures of the
+affine model are blocks [u, 1] that count once per output.
 
-Each of several scenarios is a problem of its own, in its own coordinates; they share
-what may be chosen. Sums and minima of concave functions are concave, so what proves a
-selection of one problem proves that of several.
+Each of several scenarios is a problem of its own, in its own coordinates. Sums and
+minima of concave functions are concave, so what proves a selection of one problem
+proves that of several.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from jaxcal.checks import Array, Indices, Mask, array_of
 from jaxcal.information.blocks import WhiteBlocks, rank_of_blocks
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
-from jaxcal.selection.problem.scenarios import ScenarioCriterion
+from jaxcal.selection.criteria import ScenarioCriterion
 
 _EPS = float(np.finfo(np.float64).eps)
 _IN_PLANE = 1e-7  # of whitened rows of height one above the origin
@@ -70,12 +69,10 @@ class Constraints:
             np.append(self.most, k),
         )
         counts = optimize.milp(
-            np.zeros(len(lower)),
-            integrality=np.ones(len(lower)),
-            bounds=optimize.Bounds(lower, upper),
-            constraints=within,
+            np.zeros(len(lower)), integrality=np.ones(len(lower)),
+            bounds=optimize.Bounds(lower, upper), constraints=within,
             options={"time_limit": 60.0},
-        )
+        )  # fmt: skip
         if counts.status not in (0, 2):
             raise ValueError(
                 f"constraints could not be checked for a selection: {counts.message}"
@@ -192,12 +189,12 @@ class Problem:
         return int(significant(np.linalg.svd(rows, compute_uv=False)).sum())
 
     def uncertainty(self, indices: Indices) -> float:
-        """By how much rounding may change phi of a selection (k,), as a share.
+        """By how much rounding may change phi of a selection (k,), as a share; of "det"
+        every eigenvalue.
 
-        Of "det" the share of every eigenvalue. With E the errors of the chosen blocks
-        B, one below the other, and M = L L.T, M changes by ``E.T B + B.T E``, of itself
-        by 2 |B L^-T| |E L^-T|, the first at most 1, the second |E| / sqrt(least
-        eigenvalue of M); beside what sums are rounded by.
+        With E the errors of the chosen blocks B, one below the other, and M = L L.T, M
+        changes by ``E.T B + B.T E``, of itself by 2 |B L^-T| |E L^-T|, the first at
+        most 1, the second |E| / sqrt(least eigenvalue of M); beside rounded sums.
         """
         p = self.num_regressors
         rows = self.blocks[indices].reshape(-1, p)
@@ -234,9 +231,7 @@ class Problem:
 
     def log_det(self, indices: Indices) -> float:
         """log det S of a subset, natural, in the caller's units; -inf if singular."""
-        blocks = self.raw[np.asarray(indices)[None]]
-        log_det = rank_of_blocks(blocks, self.root, self.white.size)[1][0]
-        return self.multiplicity * float(log_det)
+        return float(log_dets([self], np.asarray(indices)[None])[0])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -270,6 +265,16 @@ class ScenarioProblem(Problem):
         both = np.array([member.values(indices) for member in self.members])
         return both[:, 0], both[:, 1]
 
+    def efficiencies(self, values: Array, optima: Array) -> Array:
+        """(S, R) of reported values (S, R) against optima (S,); 0 where singular."""
+        one, pairs = self.criterion.each, zip(values, optima, strict=True)
+        return np.array(
+            [
+                [one.efficiency(x, best) if np.isfinite(x) else 0.0 for x in row]
+                for row, best in pairs
+            ]
+        )
+
     def values(self, indices: Indices) -> tuple[Array, Array]:
         """(R,) joined value, as reported, and mean log det S of subsets (R, k)."""
         of_members, log_dets = self.scenario_values(indices)
@@ -277,13 +282,7 @@ class ScenarioProblem(Problem):
         joined: ScenarioCriterion = self.criterion
         if joined.of_efficiency:
             assert self.optima is not None
-            one, best = joined.each, self.optima
-            of_members = np.array(
-                [
-                    [one.efficiency(x, best[s]) if np.isfinite(x) else 0.0 for x in row]
-                    for s, row in enumerate(of_members)
-                ]
-            )
+            of_members = self.efficiencies(of_members, self.optima)
         if joined.least:
             value = of_members.min(0) if joined.larger_is_better else of_members.max(0)
         else:
