@@ -377,10 +377,14 @@ class ScenarioCriterion:
     @property
     def name(self) -> str:
         """The name as it is written: "Mean(D)"."""
-        return f"{type(self).__name__}({self.each.name})"
+        more = ", efficiency" if self.of_efficiency else ""
+        return f"{type(self).__name__}({self.each.name}{more})"
 
     @property
     def says(self) -> str:
+        """The criterion, in words."""
+        if self.of_efficiency:
+            return f"least {self.each.name}-efficiency"
         return f"{self.each.says}, {self.word}"
 
     @property
@@ -453,24 +457,11 @@ class Worst(ScenarioCriterion):
     its own optimum, or to a bound where that is not proven.
     """
 
-    least = True
+    word, least = "worst", True
 
     def __init__(self, criterion: Any = None, efficiency: bool = False) -> None:
         super().__init__(criterion)
         self.of_efficiency = bool(efficiency)
-
-    word = "worst"
-
-    @property
-    def name(self) -> str:
-        more = ", efficiency" if self.of_efficiency else ""
-        return f"Worst({self.each.name}{more})"
-
-    @property
-    def says(self) -> str:
-        """The criterion, in words."""
-        own = f"least {self.each.name}-efficiency"
-        return own if self.of_efficiency else super().says
 
 
 class Largest(Worst):

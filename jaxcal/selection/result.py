@@ -127,10 +127,22 @@ class Selection:
     @cached_property
     def in_scenarios(self) -> ScenarioTable | None:
         """The efficiency in each scenario; None where there is one only."""
-        joint = self.problem.joint
-        if joint is None or self.criterion == "G":
+        problem = self.problem.joint
+        if problem is None or self.criterion == "G":
             return None
-        return in_scenarios(joint, self.indices)
+        optima, proven = optima_of(problem)
+        values = problem.scenario_values(self.indices[None])[0]
+        better = np.maximum if problem.criterion.each.larger_is_better else np.minimum
+        optima = better(optima, values[:, 0])
+        shares = problem.efficiencies(values, optima)[:, 0].clip(0.0, 1.0)
+        nominal = of_nominal = None
+        if problem.nominal is not None:
+            nominal = _optimum(problem.nominal, _LIMIT / 4.0)[0]
+            values_then = problem.scenario_values(nominal[None])[0]
+            of_nominal = problem.efficiencies(values_then, optima)[:, 0].clip(0.0, 1.0)
+        return ScenarioTable(
+            problem.weights, values[:, 0], optima, proven, shares, nominal, of_nominal
+        )
 
     @cached_property
     def criteria(self) -> Criteria:
@@ -250,20 +262,3 @@ def optima_of(problem: ScenarioProblem) -> tuple[Array, NDArray[np.bool_]]:
     limit = max(_LIMIT / len(problem.members), _LEAST_LIMIT)
     each = [_optimum(member, limit)[1:] for member in problem.members]
     return np.array([x for x, _ in each]), np.array([proven for _, proven in each])
-
-
-def in_scenarios(problem: ScenarioProblem, indices: Indices) -> ScenarioTable:
-    """A selection (k,) in each scenario."""
-    optima, proven = optima_of(problem)
-    values = problem.scenario_values(indices[None])[0]
-    better = np.maximum if problem.criterion.each.larger_is_better else np.minimum
-    optima = better(optima, values[:, 0])
-    nominal = of_nominal = None
-    if problem.nominal is not None:
-        nominal = _optimum(problem.nominal, _LIMIT / 4.0)[0]
-        nominal_values = problem.scenario_values(nominal[None])[0]
-        of_nominal = problem.efficiencies(nominal_values, optima)[:, 0].clip(0.0, 1.0)
-    shares = problem.efficiencies(values, optima)[:, 0].clip(0.0, 1.0)
-    return ScenarioTable(
-        problem.weights, values[:, 0], optima, proven, shares, nominal, of_nominal
-    )

@@ -177,13 +177,13 @@ def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) ->
     size = np.abs(rules.costs).max(axis=1, initial=0.0)
     size = np.where(size > 0.0, size, 1.0)
     costs = np.ascontiguousarray(rules.costs / size[:, None])
-    most, counts = rules.most / size, begun[2].copy()
+    most, node = rules.most / size, begun.copy()
 
     def bound(prices: Array) -> tuple[float, Array]:
         search.limit(costs, most, rules.order, np.maximum(prices, 0.0))
-        counts[:] = begun[2]  # from elsewhere the climb may end early
-        value = search.relaxed(begun[0], begun[1], counts, deadline.remaining_s)
-        return value, most - costs @ counts
+        node[2] = begun[2]  # from elsewhere the climb may end early
+        value = search.relaxed(node, deadline.remaining_s)
+        return value, most - costs @ node[2]
 
     prices = cheapest = np.zeros(len(most))
     best, cuts, dearest = np.inf, [], _DEAR
@@ -208,7 +208,7 @@ def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) ->
         # Halfway: a cut may be off by what the relaxation was not solved to.
         prices = 0.5 * (optimum.x[:-1] + cheapest)
     bound(cheapest)
-    return counts
+    return np.asarray(node[2])
 
 
 def _incumbents(best: int, num_blocks: int) -> tuple[Array, Array, Indices]:

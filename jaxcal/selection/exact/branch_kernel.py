@@ -122,7 +122,6 @@ class Search:
             [blocks.ravel(), prior.ravel(), root.ravel()]
         )
         copy(self.blocks, address(given[0]), given.shape[0])
-        i: cython.Py_ssize_t
         self.ruled = False
         for i in range(self.count if self.packs else 0):
             block = self.blocks + i * self.q * self.p
@@ -191,20 +190,13 @@ class Search:
         self.rules, self.most_of, self.order_of = rules, most, order
         self.price, self.paid = np.asarray(prices) @ rules, prices @ most
 
-    def relaxed(self, low, high, counts, seconds):
-        """The bound of a node, (M,) bounds and counts, these as they end."""
+    def relaxed(self, begun: cython.double[:, ::1], seconds):
+        """The bound of a node (3, M), bounds and counts, these as they end."""
         self.watch = begin(seconds)
-        start = address(self.node[0])
-        i: cython.Py_ssize_t
-        for i in range(self.count):
-            start[i], start[self.count + i] = low[i], high[i]
-            start[2 * self.count + i] = counts[i]
-        kind = self._kind_of(start)
-        bound = self._relax(
-            kind, start, start + self.count, start + 2 * self.count, -1e300, 0.0
-        )
-        for i in range(self.count):
-            counts[i] = start[2 * self.count + i]
+        low, high, c = self.node, self.node + self.count, self.node + 2 * self.count
+        copy(low, address(begun[0, 0]), 3 * self.count)
+        bound = self._relax(self._kind_of(low), low, high, c, -1e300, 0.0)
+        copy(address(begun[2, 0]), c, self.count)
         return bound
 
     def _priced(self, value, c):
@@ -893,8 +885,6 @@ class Search:
         low, high = address(begun[0, 0]), address(begun[1, 0])
         counts = address(begun[2, 0])
         self._offer(counts)
-        i: cython.Py_ssize_t
-        j: cython.Py_ssize_t
         for i in range(self.count if self.best_values.shape[0] > 1 else 0):
             if not counts[i] > low[i]:
                 continue

@@ -202,19 +202,14 @@ class Climber:
     def __init__(
         self, form, blocks, prior, root, caps, required, k, seed, rules, most, order
     ):  # fmt: skip
-        count: cython.Py_ssize_t = blocks.shape[0]
-        q: cython.Py_ssize_t = blocks.shape[1]
-        p: cython.Py_ssize_t = blocks.shape[2]
-        i: cython.Py_ssize_t
-        r: cython.Py_ssize_t
-        a: cython.Py_ssize_t
+        self.blocks, self.prior, self.root = blocks, prior, root
+        count, q, p = self.blocks.shape[0], self.blocks.shape[1], self.blocks.shape[2]
         self.kind = _KINDS[form]
         self.k, self.q, self.p, self.s = k, q, p, len(root)
         self.parts, self.dets = 1 + (self.kind != DET), 1 + (self.kind == SUBSET)
         self.fixed, self.groups = len(required), (count + WIDE - 1) // WIDE
         self.size = q * q * WIDE
         self.rows = q == 1 and self.kind == DET
-        self.blocks, self.prior, self.root = blocks, prior, root
         self.available = np.count_nonzero(caps)
         self.caps, self.counts = caps, np.zeros(count, dtype=np.intp)
         self.rules, self.most, self.order = rules, most, order
@@ -265,7 +260,7 @@ class Climber:
         self.lapack = take(at, 1 + 6 * p + 2 * p * p)
         return room - first
 
-    def climb(self, start, share, swaps, seconds):
+    def climb(self, start, share: cython.double, swaps: cython.int, seconds):
         """Complete ``start`` (size,), required first, and swap while that helps.
 
         Args:
@@ -277,43 +272,40 @@ class Climber:
             (k,) chosen, and phi, or E; -inf where that is singular.
         """
         self.watch = begin(seconds)
-        size: cython.Py_ssize_t = len(start)
-        kept: cython.double = share
-        how: cython.int = swaps
-        value: cython.double = 0.0
+        size, value = len(start), 0.0
         for r in range(size):
             self.chosen[r] = start[r]
         with cython.nogil:
             self._clear()
             for c in range(size):
                 self._count(self.chosen[c], 1)
-            if how == 2:
+            if swaps == 2:
                 self._set_known(0.0, 0.0)
                 value = self._climb(True)
             else:
-                self._grow(size, kept)
-                value = self._finish(how)
+                self._grow(size, share)
+                value = self._finish(swaps)
         return np.array(self.chosen), value
 
-    def random_climbs(self, count, chosen, phi, seconds):
+    def random_climbs(
+        self, count: cython.Py_ssize_t, chosen, phi: cython.double, seconds
+    ):
         """The best of ``chosen`` (k,) with its phi, and ``count`` random starts."""
         self.watch = begin(seconds)
         best: cython.Py_ssize_t[::1] = np.array(chosen)
-        value: cython.double = phi
-        starts: cython.Py_ssize_t = count
         with cython.nogil:
-            for _ in range(starts):
-                if self._late() and value > -INFINITY:
+            for _ in range(count):
+                if self._late() and phi > -INFINITY:
                     break
                 self._random_start()
                 reached = self._finish(True)
                 if not self._allowed():
                     continue
-                least = value + 1e-10 * max(1.0, fabs(value))
-                if reached > least or not value > -INFINITY:
-                    value = reached
+                least = phi + 1e-10 * max(1.0, fabs(phi))
+                if reached > least or not phi > -INFINITY:
+                    phi = reached
                     best[:] = self.chosen
-        return np.asarray(best), value
+        return np.asarray(best), phi
 
     def random_start(self):
         """(k,) the required, then others at random."""
@@ -336,7 +328,6 @@ class Climber:
     def _restrict(self, out, more):
         """Close what breaks a rule once ``out`` (-1: none) has gone, with ``more`` to
         come at the cheapest; true where one remains open."""
-        remains: cython.bint = False
         for i in range(self.counts.shape[0]):
             self._count(i, 0)
         if out >= 0:
@@ -359,8 +350,9 @@ class Climber:
                 if self.rules[r, i] > room:
                     self.closed[i] = INFINITY
         for i in range(self.counts.shape[0]):
-            remains = remains or self.closed[i] == 0.0
-        return remains
+            if self.closed[i] == 0.0:
+                return True
+        return False
 
     def _allowed(self):
         """Whether what is chosen keeps the rules."""
@@ -904,16 +896,12 @@ class JointClimber(Climber):
         return value
 
     def _evaluate(self, size, trial):
+        phi = self.after if trial else self.phi
         for s in range(self.addresses.shape[0]):
             value = cast(Climber, self.members[s])._evaluate(size, trial)
             if not value > -INFINITY:
                 return -INFINITY
-            value = self.scale[s] * value + self.shift[s]
-            if trial:
-                self.after[s] = value
-            else:
-                self.phi[s] = value
-        phi = self.after if trial else self.phi
+            phi[s] = self.scale[s] * value + self.shift[s]
         return self._join(address(phi[0]))
 
     def _refresh(self):

@@ -54,24 +54,22 @@ def problem_of(
     joined = criterion if isinstance(criterion, ScenarioCriterion) else Mean(criterion)
     default = "I" if offer.model and not offer.model.multiplicity else "D"
     of_one = criterion_of(joined.criterion, region, default)
-    if offer.scenarios is None:
-        one = _problem_of_one(offer, k, of_one)
-        if isinstance(of_one, G):
-            return _of_largest([one])
-        return joined_problem([one], np.ones(1), joined, None)
-    members = []
+    scenarios, members = offer.scenarios, []
     for s, alone in enumerate(offer.by_scenario()):
         try:
             members.append(_problem_of_one(alone, k, of_one))
         except ValueError as error:
+            if scenarios is None:
+                raise
             raise ValueError(f"in scenario {s}: {error}") from None
     if isinstance(of_one, G):
-        if not joined.least or joined.of_efficiency:
+        if scenarios and (not joined.least or joined.of_efficiency):
             raise ValueError('for G in scenarios use jaxcal.Worst("G")')
         return _of_largest(members)
     compared = offer.model is not None and len(members) > 1
     nominal = _problem_of_one(offer, k, of_one) if compared else None
-    return joined_problem(members, offer.scenarios.weights, joined, nominal)
+    weights = scenarios.weights if scenarios else np.ones(1)
+    return joined_problem(members, weights, joined, nominal)
 
 
 def _problem_of_one(
