@@ -44,6 +44,7 @@ MOVED = {  # longer names first
     "jaxcal.pages": "jaxcal.reports.page",
     "jaxcal.plots": "jaxcal.reports.plots",
     "jaxcal.selection.continuous": "jaxcal.designs.continuous",
+    "jaxcal.selection.exact.volume": "jaxcal.selection.exact.exact",
     "jaxcal.selection.fastest": "jaxcal.designs.travel",
     "rig.model": "rig_workbench.model",
     "rig.readings.numbers": "rig_workbench.numbers",

@@ -14,8 +14,7 @@ _SHORTER = cython.declare(cython.double, 1e-10)  # seconds that a change must sa
 
 
 def best_order(times, start):
-    """(K,) order of least time, ending anywhere, and its seconds; exact for few
-    postures."""
+    """(K,) order of least time, ending anywhere, and its seconds."""
     k = len(start)
     if k <= MOST_EXACT:
         return _exact_order(times, start)

@@ -180,12 +180,9 @@ class Search:
     # --- linear rules of the counts -------------------------------------------------
 
     def limit(self, rules, most, order, prices):
-        """Let ``rules @ counts <= most`` hold, which a bound pays ``prices`` (r,) for.
-
+        """Let ``rules @ counts <= most`` hold, which a bound pays ``prices`` (r,) for:
         phi of a selection is at most ``phi - prices @ (rules @ counts - most)``, for
-        prices from 0: Lagrange's relaxation. ``order`` (r, M): the cheapest of each
-        rule first.
-        """
+        prices from 0 (Lagrange). ``order`` (r, M): the cheapest of each rule first."""
         self.ruled = True
         self.rules, self.most_of, self.order_of = rules, most, order
         self.price, self.paid = np.asarray(prices) @ rules, prices @ most
@@ -447,7 +444,6 @@ class Search:
 
         The bound is convex and piecewise linear in mu, with slope minus the total that
         the eigenvectors above mu lose by N, plus what F allows the t readings to take.
-        At a whole selection several are best, and the largest serves its neighbours.
         """
         p, allowed = self.p, self.places - self.shares
         for d in range(p):
@@ -757,11 +753,8 @@ class Search:
             c[i] = low[i] + (self.k - fixed) * (high[i] - low[i]) / max(room, 1.0)
 
     def _relax(self, kind, low, high, c, goal, share):
-        """Climb the relaxation of a node until it is pruned, or solved well enough.
-
-        A bound at or below ``goal`` ends the climb; so does one this ``share`` of its
-        distance to the goal from solved. Returns the bound, -inf where all is singular.
-        """
+        """The bound of a node, climbed until it is pruned (at or below ``goal``), or
+        solved to this ``share`` of its distance to the goal; -inf: all is singular."""
         value = self._begin(kind, low, high, c)
         if not value > -INFINITY:
             return value
@@ -954,13 +947,9 @@ class Search:
             self.wish[self.which[f]] = 1.0 / (largest * max(free, 1e-300))
 
     def _process(self, low, high, c, slack, share, bound):
-        """Solve, tighten and, where settled, close one node; the candidate to branch
-        on, or -1.
-
-        Forcing one count away from the side the multiplier puts it on costs the bound
-        |d_i - cut| a unit, which tightens low and high (reduced-cost fixing). A bound
-        ``slack`` above the incumbent still closes the node.
-        """
+        """Solve, tighten and, if settled, close one node; the candidate to branch on,
+        or -1. Forcing one count away from the side the multiplier puts it on costs the
+        bound |d_i - cut| a unit, which tightens low and high (reduced-cost fixing)."""
         last = self.best_values.shape[0] - 1
         goal = self.best_values[last] + slack
         bound[0] = self._relax(self._kind_of(low), low, high, c, goal, share)
@@ -1022,7 +1011,8 @@ class Search:
         slope: cython.double,
         shift: cython.double,
     ):
-        """Branch until no open node is left, the room is full or the time is over.
+        """Branch until no open node is left, the room is full or the time is over: open
+        nodes left, nodes processed, and whether to go on.
 
         Args:
             nodes, bounds: (room, 3, M) and (room,) open nodes: bounds of the counts,
@@ -1031,9 +1021,6 @@ class Search:
             widest: open nodes up to which the best bound goes first, then the newest.
             tries: nodes before which a bound that is good enough ends nothing.
             slope, shift: good enough is a bound of slope times the best, plus shift.
-
-        Returns:
-            Open nodes left, nodes processed, and whether to go on.
         """
         self.watch = begin(seconds)
         values, m = self.best_values, self.count

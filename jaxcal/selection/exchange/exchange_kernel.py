@@ -261,15 +261,12 @@ class Climber:
         return room - first
 
     def climb(self, start, share: cython.double, swaps: cython.int, seconds):
-        """Complete ``start`` (size,), required first, and swap while that helps.
+        """Complete ``start`` (size,), required first, and swap while that helps: (k,)
+        chosen, and phi, or E; -inf where that is singular.
 
         Args:
             share: of k mean candidates' information, for those not chosen yet.
             swaps: 0 none, 1 those that raise phi, 2 those that raise E.
-            seconds: after which no more swaps are made.
-
-        Returns:
-            (k,) chosen, and phi, or E; -inf where that is singular.
         """
         self.watch = begin(seconds)
         size, value = len(start), 0.0
