@@ -73,9 +73,6 @@ class Design:
     """
 
     candidate_set: CandidateSet  # what is asked about
-    available: NDArray[np.bool_]  # (M,) True where a candidate may be chosen
-    scenarios: Scenarios | None  # (S, p) parameters and (S,) weights, if any
-    axes: tuple[str, ...] | None  # (n,) of the inputs, the caller's own
 
     def __init__(
         self,
@@ -99,12 +96,10 @@ class Design:
             raise ValueError(f"give either candidates or blocks, got {got}")
         rows: Any = candidates if blocks is None else commands
         labels: Any = names
-        self.candidate_set = offer = CandidateSet(
+        self.candidate_set = CandidateSet(
             rows, model, prior, noise, measured, available, required, max_replicates,
             blocks, scenarios, labels, constraints=constraints,
         ).checked()  # fmt: skip
-        self.available, self.scenarios = offer.available, offer.scenarios
-        self.axes = offer.axes
 
     @classmethod
     def from_blocks(
@@ -117,6 +112,21 @@ class Design:
     ) -> Self:
         """``Design(blocks=blocks, prior=prior, scenarios=weights, **rules)``."""
         return cls(blocks=blocks, prior=prior, scenarios=weights, **rules)
+
+    @property
+    def available(self) -> NDArray[np.bool_]:
+        """(M,) True where a candidate may be chosen."""
+        return self.candidate_set.available
+
+    @property
+    def scenarios(self) -> Scenarios | None:
+        """Parameters (S, p) and weights (S,); None: the nominal alone."""
+        return self.candidate_set.scenarios
+
+    @property
+    def axes(self) -> tuple[str, ...] | None:
+        """(n,) of the inputs, the caller's own."""
+        return self.candidate_set.axes
 
     def __repr__(self) -> str:
         model, usable = self.candidate_set.model, self.available

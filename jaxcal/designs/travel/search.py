@@ -190,17 +190,11 @@ class _TourSearch:
         tour, travel = self._tour(chosen)
         log_det = problem.log_det(self.pool[tour])
         bound = max(optimum.bound, log_det)
+        share = problem.criterion.efficiency(log_det, bound)
         return FastSelection(
-            indices=self.pool[tour],
-            seconds=travel + self.settle,
-            travel_seconds=travel,
-            log_det=log_det,
-            efficiency=problem.criterion.efficiency(log_det, bound),
-            least_efficiency=least,
-            bound=bound,
-            bound_proven=optimum.proven,
-            search_seconds=time.perf_counter() - begun,
-        )
+            self.pool[tour], travel + self.settle, travel, log_det, share, least,
+            bound, optimum.proven, time.perf_counter() - begun,
+        )  # fmt: skip
 
     def _local(
         self, wanted: float, rng: np.random.Generator
