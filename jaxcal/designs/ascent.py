@@ -203,9 +203,9 @@ def ascent_of(
 ) -> Ascent:
     problem = problem_of(offer, k, criterion, region)
     weights, scale, shift = np.ones(1), np.ones(1), np.zeros(1)
-    each, worst, alone = problem.criterion.each, False, [offer]
+    inner, worst, alone = problem.criterion.each, False, [offer]
     if (joint := problem.joint) is not None:
-        if joint.criterion.of_efficiency or each.of_each:
+        if joint.criterion.of_efficiency or inner.of_each:
             raise ValueError(
                 f"refine does not support criterion {joint.criterion.name}: between "
                 "candidates nothing proves a scenario's own optimum, or which "
@@ -213,9 +213,9 @@ def ascent_of(
             )
         weights, (scale, shift) = joint.weights, joint.terms()
         worst, alone = joint.criterion.least, offer.by_scenario()
-    makers = [blocks_of(one, each.by_name, each.of_region) for one in alone]
+    makers = [blocks_of(one, inner.by_name, inner.of_region) for one in alone]
     return Ascent(
-        offer, box, problem, seed, deadline, each, worst, weights, scale, shift, makers
+        offer, box, problem, seed, deadline, inner, worst, weights, scale, shift, makers
     )
 
 

@@ -130,8 +130,8 @@ class CompactScorer:
         progress += [count / p, min(remaining / p, 3.0), k > p]
         scalars = np.tile(np.array(progress, np.float32), (len(h), 1))
         state = np.concatenate([mean, scalars], axis=1)
-        each = np.concatenate([h, description.features], axis=2)
-        g = self._dense("join", each, state)
+        inputs = np.concatenate([h, description.features], axis=2)
+        g = self._dense("join", inputs, state)
         g *= description.active[..., None]
         for name in self._decoder:
             g = self._round(name, g, description)
