@@ -212,7 +212,8 @@ class Design:
         subset = np.asarray(indices)
         if subset.ndim != 1 or subset.dtype.kind not in "iu" or not len(subset):
             rule = "indices must be a (k,) array of whole numbers, at least one"
-            raise ValueError(f"{rule}, got {subset.dtype} of shape {subset.shape}")
+            got = f"shape {subset.shape} and dtype {subset.dtype}"
+            raise ValueError(f"{rule}, got {got}")
         subset = subset.astype(np.int64)
         problem = _with_optima(self._problem_with(subset, criterion))
         if reference == "bound":
