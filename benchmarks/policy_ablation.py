@@ -41,7 +41,7 @@ from jaxcal.commands.train_configuration import teacher
 from jaxcal.extras import versions
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.information.regression import log_det_information
-from jaxcal.learning.environments import scenarios
+from jaxcal.learning.environments import selection
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import scorer
 from jaxcal.learning.policies.compact import CompactNetwork
@@ -51,7 +51,7 @@ from jaxcal.learning.policies.features import (
     DecisionFeatures,
 )
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.runtime import cache
+from jaxcal.learning.runtime import processes
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training import presets
 from jaxcal.selection import exact_batch, exchange_batch, greedy_batch, select
@@ -167,8 +167,8 @@ def uniform_sets(num: int, m: int, k: int, n: int, seed: int) -> np.ndarray:
 
 
 def shaped_sets(num: int, name: str, seed: int) -> np.ndarray:
-    """(num, 50, 3) candidates of one shape of ``environments.scenarios``."""
-    draw = scenarios.mixture(SelectionConfig(), (name,))
+    """(num, 50, 3) candidates of one shape of ``selection.mixture``."""
+    draw = selection.mixture(SelectionConfig(), (name,))
     keys = jax.random.split(jax.random.key(seed), num)
     return np.asarray(jax.jit(jax.vmap(draw))(keys)[0], np.float64)
 
@@ -213,7 +213,7 @@ def all_tasks(num: int, seed: int) -> list[tuple[str, Sets]]:
     for k in (5, 6, 8, 12):
         sets = uniform_sets(num, 50, k, 3, seed)
         out.append((f"M = 50, K = {k}", Sets.make(sets, k)))
-    for name in scenarios.SHAPES[1:]:
+    for name in selection.SHAPES[1:]:
         out.append((f"{name}, K = 4", Sets.make(shaped_sets(num, name, seed), 4)))
     rng = np.random.default_rng([seed, 30])
     rank = rng.permuted(np.tile(np.arange(50), (num, 1)), axis=1)
@@ -420,7 +420,7 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     if arguments.json:
         require_writable_folder(pathlib.Path(arguments.json).resolve().parent)
-    cache.keep_compiled_programs()
+    processes.keep_compiled_programs()
     result: dict[str, Any] = {
         "arguments": vars(arguments),
         "versions": versions(),

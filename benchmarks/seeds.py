@@ -23,7 +23,7 @@ import numpy as np
 
 from jaxcal.commands.train import main as train
 from jaxcal.information.regression import log_det_information
-from jaxcal.learning.runtime import cache
+from jaxcal.learning.runtime import processes
 from jaxcal.learning.training import presets
 from jaxcal.selection import exact_batch
 from jaxcal.selection.policy import select_batch
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=1000, help="sets measured")
     parser.add_argument("--out", type=pathlib.Path, help="where to keep the runs")
     arguments = parser.parse_args()
-    cache.keep_compiled_programs()
+    processes.keep_compiled_programs()
     seeds = [int(seed) for seed in arguments.seeds.split(",")]
     sets = np.random.default_rng(20261122).random((arguments.sets, 50, 3))
     optimum = exact_batch(sets, 4)

@@ -21,6 +21,8 @@ MOVED = {  # longer names first
     "jaxcal.learning.environments.brax_env": "jaxcal.learning.brax",
     "jaxcal.learning.environments.randomness": "jaxcal.learning.environments.selection",
     "jaxcal.learning.policies.geometry": "jaxcal.learning.policies.features",
+    "jaxcal.learning.runtime.cache": "jaxcal.learning.runtime.processes",
+    "jaxcal.learning.environments.scenarios": "jaxcal.learning.environments.selection",
     "jaxcal.learning.settings": "jaxcal.learning.config",
     "jaxcal.learning.training.config": "jaxcal.learning.training.presets",
     "jaxcal.learning.training.imitation": "jaxcal.learning.training.postures",

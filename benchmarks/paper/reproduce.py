@@ -87,9 +87,9 @@ def _make(
 
     from benchmarks.paper.exhibits.claims import claims
     from benchmarks.paper.exhibits.study import STUDIES, Settings
-    from jaxcal.learning.runtime import cache
+    from jaxcal.learning.runtime import processes
 
-    cache.keep_compiled_programs()
+    processes.keep_compiled_programs()
     settings = Settings(seed, quick, data, studies or STUDIES)
     try:
         exhibits = _exhibits(settings, progress)

@@ -57,11 +57,11 @@ def jaxcal_paper(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
 def ours(which: str, sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     import dataclasses
 
-    from jaxcal.learning.runtime import cache
+    from jaxcal.learning.runtime import processes
     from jaxcal.learning.training import postures as training
     from jaxcal.learning.training import presets
 
-    cache.keep_compiled_programs()
+    processes.keep_compiled_programs()
     config = presets.load("compact")
     if which == "observation":
         config = presets.with_values(
@@ -86,11 +86,11 @@ def ours(which: str, sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
 def brax(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     """``python train.py --trainer brax``: brax's own PPO, the network 64 wide."""
     from jaxcal.learning.policies.networks import build
-    from jaxcal.learning.runtime import cache
+    from jaxcal.learning.runtime import processes
     from jaxcal.learning.training import brax_ppo, presets
     from jaxcal.learning.training import postures as training
 
-    cache.keep_compiled_programs()
+    processes.keep_compiled_programs()
     config = presets.with_values(
         brax_ppo.adapted(presets.load("compact")), {"num_episodes": 3_000_000}
     )

@@ -41,11 +41,11 @@ _UPDATE = (
     _RESIDENT
     + """
 import dataclasses, jax
-from jaxcal.learning.runtime import cache
+from jaxcal.learning.runtime import processes
 from jaxcal.learning.core import ppo
 from jaxcal.learning.training import presets
 from jaxcal.learning.training.run import updates
-cache.keep_compiled_programs()
+processes.keep_compiled_programs()
 config = presets.with_values(presets.load("compact"), {
     "episodes_per_update": EPISODES, "num_minibatches": EPISODES // 512})
 jax.devices()
@@ -63,9 +63,9 @@ _MANY = (
     _RESIDENT
     + """
 import dataclasses, tempfile
-from jaxcal.learning.runtime import cache
+from jaxcal.learning.runtime import processes
 from jaxcal.learning.training import postures as training, presets
-cache.keep_compiled_programs()
+processes.keep_compiled_programs()
 config = presets.with_values(presets.load("compact"), {
     "episodes_per_update": 16, "episodes_per_set": 4, "num_minibatches": 1,
     "num_epochs": 1, "width": 8, "encoder_rounds": 1, "num_candidates": 8,

@@ -59,7 +59,7 @@ from jaxcal.adaptive.rules import (
 from jaxcal.adaptive.session import jit_by_class
 from jaxcal.adaptive.tuning import search, tune
 from jaxcal.files import require_writable_folder, write_text
-from jaxcal.learning.runtime import cache
+from jaxcal.learning.runtime import processes
 
 METHODS = (
     "random", "gain", "rate", "shares", "ahead", "priced", "state", "two_step",
@@ -240,7 +240,7 @@ def main(argv: list[str] | None = None) -> int:
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
             require_writable_folder(folder)
-    cache.keep_compiled_programs()
+    processes.keep_compiled_programs()
     if options.tune:
         print(tuned_for_all(options.seed))
         return 0

@@ -48,7 +48,7 @@ from jaxcal.adaptive.tasks.knee import PRICED, STATE_RULE, knee
 from jaxcal.adaptive.tuning import tune
 from jaxcal.extras import versions
 from jaxcal.files import require_writable_folder, write_text
-from jaxcal.learning.runtime import cache
+from jaxcal.learning.runtime import processes
 
 OTHER: dict[str, dict[str, Any]] = {
     "as trained": {},
@@ -275,7 +275,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     if options.json is not None:
         require_writable_folder(options.json.parent)
-    cache.keep_compiled_programs()
+    processes.keep_compiled_programs()
     trained = training.load(options.checkpoint)
     document: dict[str, Any] = {
         "versions": versions(), "policy": trained.meta, "seed": options.seed,

@@ -1,7 +1,6 @@
 """``python train.py`` and ``jaxcal train``: parse, train, say how it goes.
 
-One command trains what selects postures (``--preset``) and what picks the next
-measurement of a task (``--task``); they differ in what is read from the flags.
+What is trained selects postures, or with ``--task`` picks the next measurement.
 """
 
 from __future__ import annotations
@@ -19,14 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.arguments import refused, told, typed_line
 from jaxcal.checks import aligned
-from jaxcal.commands.train_configuration import (
-    fixed_validation,
-    of_postures,
-    of_task,
-    teacher,
-)
 from jaxcal.extras import MissingExtraError, needs
-from jaxcal.learning.runtime import cache, processes
+from jaxcal.learning.runtime import processes
 
 if TYPE_CHECKING:
     from jaxcal.commands.train_arguments import TrainOptions
@@ -42,16 +35,12 @@ _TASK = ("reward", "nats", "less the rule's")
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
-    """Run.
-
-    Returns:
-        0 when trained or stopped on request, 1 where the training diverged, 2 when
-        something given was wrong, 3 where another process of the job was lost.
-    """
+    """Train: 0 when trained or stopped on request, 1 where the training diverged, 2
+    when something given was wrong, 3 where another process of the job was lost."""
     words = list(sys.argv[1:] if argv is None else argv)
 
     def alone() -> int:  # this process may be one of several
-        cache.keep_compiled_programs()
+        processes.keep_compiled_programs()
         try:
             with needs("policy", "training"):
                 from jaxcal.commands.train_arguments import read
@@ -75,17 +64,19 @@ def _run(arguments: TrainOptions, prog: str) -> int:
             arguments.task = _task_held(out)
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export takes a file NAME.npz, got {arguments.export}")
-    configuration = of_task if arguments.task else of_postures
-    configure = functools.partial(configuration, arguments, out)
-    config: Any = None
-    later = arguments.task, arguments.resume, arguments.sweep, "jax" in sys.modules
-    if not any((*later, arguments.values.get("num_seeds"))):
-        config = configure()  # what is wrong is said before JAX is loaded
+    from jaxcal.commands.train_configuration import of_postures, of_task
+
+    made_by = of_task if arguments.task else of_postures
+    configure: Any = functools.partial(made_by, arguments, out)
+    jax, config = sys.modules.get("jax"), None
     with needs("policy", "training"):
+        if jax is None or not jax.distributed.is_initialized():
+            config = configure()  # what is wrong is said before JAX is loaded
         from jaxcal.learning.runtime import devices
 
-    if (runs := _num_runs(arguments, out)) > 1:
-        devices.a_device_for_each_core(runs)
+    seeds = arguments.values.get("num_seeds") or getattr(config, "num_seeds", None)
+    if seeds and seeds > 1:
+        devices.a_device_for_each_core(seeds)
     config = devices.on_first(configure) if config is None else config
     with _stop_on_signals() as stop:
         if arguments.trainer == "brax":
@@ -115,18 +106,14 @@ def _run(arguments: TrainOptions, prog: str) -> int:
         f"{typed_line(prog.replace('train', 'evaluate'))}{task} --checkpoint {out}"
     )
     if arguments.export:
-        _export(out, arguments.export, of_task=bool(arguments.task))
+        from jaxcal.adaptive.policy import training
+        from jaxcal.learning.runtime import weights
+        from jaxcal.learning.training import checkpoint
+
+        load: Callable[..., Any] = training.load if arguments.task else checkpoint.load
+        weights.write(arguments.export, load(out).weights)
+        print(f"exported the policy to {arguments.export}")
     return 0
-
-
-def _export(run: pathlib.Path, path: str, of_task: bool) -> None:
-    from jaxcal.adaptive.policy import training
-    from jaxcal.learning.runtime import weights
-    from jaxcal.learning.training import checkpoint
-
-    load: Callable[..., Any] = training.load if of_task else checkpoint.load
-    weights.write(path, load(run).weights)
-    print(f"exported the policy to {path}")
 
 
 def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) -> int:
@@ -144,11 +131,12 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
         schema, unit, columns = trainer.SCHEMA, "decisions", _TASK
         introduction = f"task {config.task}, seed {config.seed}; run folder {out}"
     else:
+        from jaxcal.commands.train_configuration import fixed_validation, teacher
         from jaxcal.learning.training import checkpoint
         from jaxcal.learning.training import postures as trainer
 
         rows = config.ppo.rows_per_minibatch
-        mesh = devices.make_mesh(rows, arguments.devices, config.num_runs)
+        mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
         schema, unit, columns = checkpoint.SCHEMA, "episodes", _POSTURES
         introduction = _introduction(config, out, devices.describe(mesh))
         more = {"validation": None, "teacher": teacher}
@@ -182,11 +170,8 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
 
 
 def _task_held(out: pathlib.Path) -> str | None:
-    """The task that a run is of; None of postures, or where there is no run.
-
-    Raises:
-        ValueError: the task cannot be loaded, a file that has moved, say.
-    """
+    """The task that a run is of; None of postures, or where there is no run. A task
+    that cannot be loaded, a file that has moved, say, is refused."""
     from jaxcal.adaptive.policy.training import SCHEMA
     from jaxcal.adaptive.tasks import registry
     from jaxcal.learning.training import checkpoint
@@ -204,23 +189,6 @@ def _task_held(out: pathlib.Path) -> str | None:
     return task
 
 
-def _num_runs(arguments: TrainOptions, out: pathlib.Path) -> int:
-    """How many runs begin or go on together; what is wrong is refused later."""
-    from jaxcal.learning.config import runs_of
-
-    seeds = arguments.values.get("num_seeds") or 1
-    sweep: Sequence[Any] = arguments.sweep
-    if arguments.resume:
-        from jaxcal.adaptive.policy.training import SCHEMA
-        from jaxcal.learning.training import checkpoint
-
-        schema = SCHEMA if arguments.task else checkpoint.SCHEMA
-        with contextlib.suppress(checkpoint.CheckpointError):
-            meta = checkpoint.read_meta(out, schema)[1]
-            seeds, sweep = meta["num_seeds"], meta.get("sweep", ())
-    return len(runs_of(0, seeds, sweep))
-
-
 def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
     import jax
 
@@ -229,8 +197,6 @@ def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
     task, seed = config.tasks[0], f"seed {config.seed}"
     if config.num_seeds > 1:
         seed = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
-    for name, values in config.sweep:
-        seed += f", {name} " + " ".join(f"{value:g}" for value in values)
     env = task.environment
     origin = f" from {task.given.name}" if task.given else ""
     return (
@@ -281,25 +247,23 @@ def _show(report: Report, measured: tuple[str, ...]) -> None:
 def _compare_runs(
     out: pathlib.Path, config: Any, measured: tuple[str, ...], schema: str
 ) -> None:
-    """What every seed reached with every swept value, where they were several."""
+    """What every seed reached, where they were several."""
     import numpy as np
 
     from jaxcal.learning.training import checkpoint
 
-    if config.num_runs == 1:
+    if config.num_seeds == 1:
         return
     progress = checkpoint.read_meta(out, schema)[1]["progress"]
     values = np.array([[seed[name] for name in measured] for seed in progress["seeds"]])
     if not len(values):
         return
-    heads = [[f"{value:g}" for value in run.values()] for run in config.runs]
-    if not config.sweep:
-        heads += [["mean"], ["spread"]]
-        values = np.stack([*values, values.mean(0), values.std(0, ddof=1)])
-    table = [[*config.runs[0], *measured, ""]]
+    heads = [*map(str, range(config.seed, config.seed + len(values))), "mean", "spread"]
+    values = np.stack([*values, values.mean(0), values.std(0, ddof=1)])
+    table = [["seed", *measured, ""]]
     for number, (head, row) in enumerate(zip(heads, values, strict=True)):
         best = "best" * (number == progress["best"])
-        table.append([*head, *(f"{x:.4f}" for x in row), best])
+        table.append([head, *(f"{x:.4f}" for x in row), best])
     print("\n".join(aligned(table)))
 
 

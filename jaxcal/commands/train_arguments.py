@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import pathlib
 import textwrap
@@ -12,9 +11,9 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
-from jaxcal.arguments import Parser, number_type, typed_line, values_of
+from jaxcal.arguments import Parser, typed_line, values_of
 from jaxcal.commands.tables import holds_sets, read_pool
-from jaxcal.learning.config import TRACED, Setting, StreamsConfig, settings_of
+from jaxcal.learning.config import Setting, StreamsConfig, settings_of
 from jaxcal.learning.environments.task import GivenCandidates
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.training import presets
@@ -38,16 +37,12 @@ what to try first:
 
 more examples:
   {program} --task knee            choose each measurement from the last results
-  {program} --task knee --with cells=16 sigma=0.05 --out runs/knee_16
   {program} --seeds 8 --out runs/seeds   eight runs side by side: mean, spread, best
-  {program} --sweep learning_rate=1e-3,3e-3 entropy_start=0.01,0.02 --out runs/sweep
-                                   four runs in one table
   {program} --resume --out runs/compact      resume a run
   {program} --resume --episodes 200000 --out runs/compact   and extend it
   {program} --preset general --export checkpoints/default.npz   the shipped policy
   {program} --trainer brax --episodes 50000  the same task, brax's own PPO
   srun {program}                             all tasks of a SLURM job step
-  {program} --coordinator host0:4711 --num-processes 2 --process-id 0   and 1
 
 A run folder holds metrics.csv and checkpoint/. Evaluate it with
   {evaluate} --checkpoint runs/compact
@@ -62,27 +57,11 @@ FIRST = {"seed", "seeds", "learning_rate", "width", "episodes", "updates", "kind
 _NAMES = {"num_episodes": "episodes", "num_updates": "updates", "num_seeds": "seeds"}
 
 
-Swept = tuple[str, tuple[float, ...]]
-
-
-def _swept(text: str) -> Swept:
-    """Name and values of ``NAME=X,Y``."""
-    name, _, values = text.partition("=")
-    number = number_type(float)
-    try:
-        held = tuple(number(value) for value in values.split(","))
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(
-            f"must be NAME=X,Y with numbers, got {text!r}"
-        ) from error
-    return name.replace("-", "_"), held
-
-
 @dataclasses.dataclass
 class TrainOptions:
     """What is trained and where it is kept."""
 
-    RARE: ClassVar[Any] = {"no_validation", "devices", "sweep"}
+    RARE: ClassVar[Any] = {"no_validation", "devices"}
 
     preset: Annotated[str | None, "for postures, see below [compact]", "NAME"] = None
     task: Annotated[str | None, "of sequential measurement, see below", "NAME"] = None
@@ -105,13 +84,6 @@ class TrainOptions:
         bool, "do not measure the gap to the proven optimum during training"
     ] = False
     devices: Annotated[int | None, "devices of each process [all]"] = None
-    sweep: Annotated[
-        tuple[Swept, ...],
-        _swept,
-        "values to compare; every combination runs with every seed and is listed in "
-        "one table. Names: " + ", ".join(TRACED),
-        "NAME=X,Y",
-    ] = ()
     # What the other flags set: field of a configuration to value.
     values: dict[str, Any] = dataclasses.field(default_factory=dict, init=False)
 
@@ -123,7 +95,7 @@ class TrainOptions:
 
 def flag_of(name: str) -> str:
     """The flag that sets a field."""
-    return "--" + _NAMES.get(name, name).replace("_", "-")
+    return "--" + _NAMES.get(name, name).rstrip("_").replace("_", "-")
 
 
 def _held(name: str) -> Any:
@@ -155,15 +127,12 @@ def _flags(title: str, settings: Iterable[Setting]) -> type:
 
 _POSTURES = {f.name: f for part in presets.PARTS.values() for f in settings_of(part)}
 _TASKS = {f.name: f for part in TASK_PARTS for f in settings_of(part)}
+_ONE = [field for name, field in _POSTURES.items() if name not in _TASKS]
+_OTHER = [field for name, field in _TASKS.items() if name not in _POSTURES]
 _BOTH = [field for name, field in _POSTURES.items() if name in _TASKS]
 Shared = _flags("for postures and tasks", _BOTH)
-OfPostures = _flags(
-    "for postures, in presets of one task",
-    [field for name, field in _POSTURES.items() if name not in _TASKS],
-)
-OfTasks = _flags(
-    "of tasks", [field for name, field in _TASKS.items() if name not in _POSTURES]
-)
+OfPostures = _flags("for postures, in presets of one task", _ONE)
+OfTasks = _flags("of tasks", _OTHER)
 
 
 def asked(
@@ -186,7 +155,16 @@ def asked(
 
 def read(prog: str, argv: Sequence[str]) -> TrainOptions:
     """The command line; ``prog`` is what was typed, "train.py" or "jaxcal train"."""
-    asks = {"-h", "--help"} & set(argv)  # else tasks are not loaded, nor JAX with them
+    more = None
+    if {"-h", "--help"} & set(argv):  # else tasks are not loaded, nor JAX with them
+        from jaxcal.adaptive.tasks import registry
+
+        more = _EPILOG.format(
+            program=typed_line(prog),
+            evaluate=typed_line(prog.replace("train", "evaluate")),
+            presets=_abouts(presets),
+            tasks=_abouts(registry),
+        )
     parser = Parser(
         prog=prog,
         usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
@@ -198,66 +176,42 @@ def read(prog: str, argv: Sequence[str]) -> TrainOptions:
             "these numbers, by PPO alone.",
             86,
         ),
-        epilog=_EPILOG.format(
-            program=typed_line(prog),
-            evaluate=typed_line(prog.replace("train", "evaluate")),
-            presets=_abouts(),
-            tasks=_tasks(),
-        )
-        if asks
-        else None,
+        epilog=more,
     ).of(asked)
     return asked(**values_of(parser.parse_args(argv)))
 
 
 def given_flags(arguments: TrainOptions, task: bool) -> dict[str, Any]:
-    """The fields of a configuration that were given: name to value.
-
-    Raises:
-        ValueError: a flag is given that a task, or a preset, does not read.
-    """
+    """The fields of a configuration that were given: name to value; a flag that the
+    task, or the preset, does not read is refused."""
     flags, read = arguments.values, _TASKS if task else _POSTURES
-    unread = {flag_of(name) for name in set(flags) - set(read)}
-    if task:
-        unread |= {"--preset"} if arguments.preset else set()
-        unread |= {"--candidates"} if arguments.candidates else set()
-        unread |= {"--trainer"} if arguments.trainer != "jaxcal" else set()
-        unread |= {"--no-validation"} if arguments.no_validation else set()
-    elif arguments.with_:
-        unread.add("--with")
+    others = ("preset", "candidates", "no_validation") if task else ("with_",)
+    unread = {*flags} - {*read} | {name for name in others if getattr(arguments, name)}
+    if task and arguments.trainer != "jaxcal":
+        unread.add("trainer")
     if unread:
         who = f"--task {arguments.task}" if task else f"preset {arguments.preset_name}"
         it = "it" if len(unread) == 1 else "them"
-        raise ValueError(
-            f"{who} does not use {', '.join(sorted(unread))}: leave {it} out"
-        )
+        names = ", ".join(sorted(map(flag_of, unread)))
+        raise ValueError(f"{who} does not use {names}: leave {it} out")
     return flags
 
 
-def _abouts() -> str:
+def _abouts(known: Any) -> str:
+    """The lines on presets, or tasks, that the module or registry knows."""
     lines = []
-    for name in presets.names():
-        about = f"  {name:9} {presets.load(name).about}"
+    for name in known.names():
+        about = f"  {name:9} {known.load(name).about}"
         lines += textwrap.wrap(about, 86, subsequent_indent=" " * 12)
     return "\n".join(lines)
-
-
-def _tasks() -> str:
-    from jaxcal.adaptive.tasks import registry
-
-    return "\n".join(
-        f"  {name:9} {registry.load(name).about}" for name in registry.names()
-    )
 
 
 # -- the user's own postures ----------------------------------------------------------
 
 
 def candidates_of(path: str) -> GivenCandidates:
-    """The user's own candidates, each axis mapped to [0, 1] over the whole file.
-
-    The best postures do not depend on the unit; float32 and the paper's network do.
-    """
+    """The user's own, each axis mapped to [0, 1] over the whole file: the best postures
+    do not depend on the unit; float32 and the paper's network do."""
     from jaxcal.evaluation.dataset import load_dataset
 
     if holds_sets(path):

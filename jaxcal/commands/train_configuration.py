@@ -1,5 +1,4 @@
-"""What ``train`` begins with: its configuration, from flags or from a run; the sets to
-validate on, and what to imitate."""
+"""What ``train`` begins with: a configuration, sets to validate on, what to imitate."""
 
 from __future__ import annotations
 
@@ -10,30 +9,31 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxcal.adaptive.policy.config import PolicyConfig
+from jaxcal.commands.train_arguments import (
+    TASK_PARTS,
+    TrainOptions,
+    candidates_of,
+    flag_of,
+    given_flags,
+    trained_on,
+)
 from jaxcal.extras import needs
 from jaxcal.files import require_writable_folder
+from jaxcal.learning.config import settings_of
+from jaxcal.learning.environments.task import GivenCandidates
+from jaxcal.learning.training import presets
+from jaxcal.learning.training.presets import TrainConfig
+from jaxcal.selection import exact_batch, exchange_batch
 
 if TYPE_CHECKING:
-    from jaxcal.adaptive.policy.config import PolicyConfig
-    from jaxcal.adaptive.rules import StateRule
-    from jaxcal.adaptive.tasks.registry import Entry
-    from jaxcal.commands.train_arguments import TrainOptions
-    from jaxcal.learning.environments.task import GivenCandidates
     from jaxcal.learning.training.postures import Validation
-    from jaxcal.learning.training.presets import TrainConfig
 
 _VALIDATED = 500  # sets that a training run is measured on
 
 
 def of_postures(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
     """Configuration of postures: from the flags, or from the run to go on with."""
-    from jaxcal.commands.train_arguments import (
-        candidates_of,
-        given_flags,
-        trained_on,
-    )
-    from jaxcal.learning.training import presets
-
     flags = given_flags(arguments, task=False)
     path = arguments.candidates
     candidates = candidates_of(path) if path else None
@@ -41,17 +41,16 @@ def of_postures(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
     if arguments.trainer == "brax":
         config = _for_brax(config, arguments, flags)
     if arguments.resume:
-        budget = _budget(arguments, flags, out)
-        return _prolonged(_configuration_of(out, candidates), budget)
+        config = _configuration_of(out, candidates)
+        return _prolonged(config, arguments, flags, out)
     _refuse_to_overwrite(out)
     if candidates is None:
         config = presets.with_values(config, flags)
     else:
         config = trained_on(config, candidates, flags)
-    config = dataclasses.replace(config, sweep=tuple(arguments.sweep))
-    if config.num_runs > 1 and arguments.no_validation:
+    if config.num_seeds > 1 and arguments.no_validation:
         raise ValueError(
-            "--seeds and --sweep compare runs by validation: leave out --no-validation"
+            "--seeds compares runs by validation: leave out --no-validation"
         )
     require_writable_folder(out)
     return config
@@ -61,7 +60,6 @@ def _configuration_of(
     out: pathlib.Path, candidates: GivenCandidates | None
 ) -> TrainConfig:
     from jaxcal.learning.training import checkpoint
-    from jaxcal.learning.training.presets import TrainConfig
 
     config = TrainConfig.from_meta(checkpoint.read_meta(out)[1])
     held = config.tasks[0].given
@@ -81,15 +79,9 @@ def _for_brax(
     """A preset as brax trains it; what brax does not read is refused."""
     import jax
 
-    from jaxcal.commands.train_arguments import flag_of
-
     with needs("study", "--trainer brax"):
         from jaxcal.learning.training import brax_ppo
 
-    refused = {"resume": arguments.resume, "sweep": arguments.sweep}
-    for name, value in (refused | given).items():
-        if value and name in ("resume", "sweep", "num_seeds"):
-            raise ValueError(f"{flag_of(name)} works with --trainer jaxcal only")
     if jax.process_count() > 1:
         raise ValueError("--trainer brax works in a single process only")
     if len(config.tasks) > 1:
@@ -97,32 +89,33 @@ def _for_brax(
             f"--trainer brax trains on one task, preset {config.preset} has "
             f"{len(config.tasks)}: use compact or paper"
         )
-    unread = {"devices": arguments.devices, "no_validation": arguments.no_validation}
-    brax_ppo.require_read([*given, *(name for name, value in unread.items() if value)])
+    others = ("devices", "no_validation", "resume")
+    names = {*given, *(name for name in others if getattr(arguments, name))}
+    if unread := names - brax_ppo.READ:
+        flags = ", ".join(sorted(map(flag_of, unread)))
+        raise ValueError(f"--trainer brax does not use {flags}: leave it out")
     return brax_ppo.adapted(config)
 
 
 def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
     """Configuration of a task: from the flags, or from the run to go on with."""
     from jaxcal.adaptive.policy import training
-    from jaxcal.adaptive.policy.config import PolicyConfig
+    from jaxcal.adaptive.rules import StateRule
     from jaxcal.adaptive.tasks import registry
-    from jaxcal.commands.train_arguments import TASK_PARTS, given_flags
-    from jaxcal.learning.config import settings_of
+    from jaxcal.adaptive.tuning import tune
     from jaxcal.learning.training import checkpoint
 
     assert arguments.task is not None  # it is what this function is for
     entry = registry.load(arguments.task)
     flags = given_flags(arguments, task=True)
     if arguments.resume:
-        budget = _budget(arguments, flags, out)
-        _, meta = checkpoint.read_meta(out, training.SCHEMA)
-        config = PolicyConfig.from_meta(meta)
+        config = PolicyConfig.from_meta(checkpoint.read_meta(out, training.SCHEMA)[1])
         held, given_task = map(pathlib.Path, (config.task, arguments.task))
         moved = held.suffix == ".py" and held.name == given_task.name
         if held != given_task and not moved:
             raise ValueError(f"--task must be {config.task}, the task of {out}")
-        return _prolonged(dataclasses.replace(config, task=arguments.task), budget)
+        config = dataclasses.replace(config, task=arguments.task)
+        return _prolonged(config, arguments, flags, out)
     _refuse_to_overwrite(out)
     options = registry.options_from(entry, arguments.with_)
     ppo, policy = (
@@ -130,50 +123,34 @@ def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
         for part in TASK_PARTS
     )
     require_writable_folder(out)
-    base = entry.rules.get("state") or _tuned(entry, options)
+    base = entry.rules.get("state")
+    if base is None:
+        print("tuning the rule that the policy starts from ...", flush=True)
+        base = tune(entry.make(**options), StateRule(), episodes=1024, seed=1)
     config = PolicyConfig(task=arguments.task, base=base, options=options, **policy)
     changed = dataclasses.replace(config.ppo, **ppo)
-    return dataclasses.replace(config, ppo=changed, sweep=tuple(arguments.sweep))
+    return dataclasses.replace(config, ppo=changed)
 
 
-def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
-    """The base rule of a task that ships none: tuned before the training."""
-    from jaxcal.adaptive.rules import StateRule
-    from jaxcal.adaptive.tuning import tune
-
-    print("tuning the rule that the policy starts from ...", flush=True)
-    return tune(entry.make(**options), StateRule(), episodes=1024, seed=1)
-
-
-def _budget(
-    arguments: TrainOptions, flags: Mapping[str, Any], out: pathlib.Path
-) -> dict[str, int]:
-    """What a run may be prolonged to; other flags are refused beside ``--resume``."""
-    from jaxcal.commands.train_arguments import flag_of
-
-    more = {"with": arguments.with_, "sweep": arguments.sweep}
-    given = {*flags, *(name for name, value in more.items() if value)}
-    budget = given & {"num_episodes", "num_updates"}
-    if given - budget:
+def _prolonged(
+    config: Any, arguments: TrainOptions, flags: Mapping[str, Any], out: pathlib.Path
+) -> Any:
+    """A run to go on with, where asked to a larger budget; what it imitates stays what
+    it was. Other flags are refused beside ``--resume``."""
+    given = {*flags, *(["with"] if arguments.with_ else [])}
+    if unread := given - {"num_episodes", "num_updates"}:
         raise ValueError(
             f"--resume takes its configuration from {out}; leave out "
-            + ", ".join(sorted(map(flag_of, given - budget)))
+            + ", ".join(sorted(map(flag_of, unread)))
         )
-    return {name: flags[name] for name in budget}
-
-
-def _prolonged(config: Any, budget: Mapping[str, int]) -> Any:
-    """A run to go on with to a larger budget; what it imitates stays what it was."""
-    from jaxcal.commands.train_arguments import flag_of
-
-    for name, value in budget.items():
+    for name, value in flags.items():
         if value <= (held := getattr(config.ppo, name)):
             raise ValueError(
                 f"{flag_of(name)} must be above {held}, what the run already has, got "
                 f"{value}"
             )
     imitated = getattr(config, "num_imitated", 0)
-    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **budget))
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **flags))
     if imitated:
         share = imitated / config.ppo.num_updates
         config = dataclasses.replace(config, imitation=share)
@@ -190,16 +167,11 @@ def _refuse_to_overwrite(out: pathlib.Path) -> None:
 
 
 def fixed_validation(config: TrainConfig) -> Validation:
-    """500 sets as the first task has them, and their optima.
-
-    Uniform ones, never trained on, that depend on M and n only, so runs with other
-    seeds or networks are measured on the same ones. Where the user gave candidates, 500
-    draws of those.
-    """
+    """500 uniform sets, never trained on, that depend on M and n of the first task
+    only, or draws of the user's candidates; and their optima."""
     import jax
 
     from jaxcal.learning.training.postures import Validation
-    from jaxcal.selection import exact_batch
 
     task = config.tasks[0]
     env = task.environment
@@ -220,14 +192,9 @@ def fixed_validation(config: TrainConfig) -> Validation:
 def teacher(
     candidates: np.ndarray, available: np.ndarray, given: np.ndarray, k: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The best postures of every set, as ``postures.Teacher`` wants them.
-
-    The proven optimum where k is the number of regressors. Above it, what Fedorov
-    exchange finds from its default restarts: almost always optimal, and in a time that
-    does not depend on the shape of the candidates, as that of a proof does.
-    """
-    from jaxcal.selection import exact_batch, exchange_batch
-
+    """A ``postures.Teacher``: the proven optimum where k is the number of regressors;
+    above it what Fedorov exchange finds, almost always that, in a time that does not
+    depend on the shape of the candidates."""
     required = given if given.shape[1] else None
     solve = exact_batch if k == candidates.shape[2] + 1 else exchange_batch
     solved = solve(candidates, k, available=available, required=required, num_outputs=1)

@@ -1,7 +1,7 @@
 """Episodes as ``brax.envs.base.Env``, and what brax's trainers need; this loads brax.
 
-The network masks what may not be chosen, from what is observed. ``done`` is 1 on the
-last step: an episode ends, it is never cut off, so brax's ``truncation`` stays 0.
+The network masks what may not be chosen, from what is observed. An episode ends, it is
+never cut off, so brax's ``truncation`` stays 0.
 """
 
 from __future__ import annotations
@@ -127,12 +127,9 @@ class _MaskedCategorical(distribution.ParametricDistribution):
 def brax_networks(
     env: EpisodeEnv, network: nn.Module | None = None
 ) -> Callable[..., PPONetworks]:
-    """A ``network_factory`` for ``brax.training.agents.ppo.train``.
-
+    """A ``network_factory`` for brax's ``ppo.train``, which trains two copies of
     ``network``: (..., observation_size) -> masked logits (..., action_size) and value
-    (...,); ``env.functional.network()`` when None. brax trains two copies of its
-    weights, one for the policy and one for the value.
-    """
+    (...,); ``env.functional.network()`` when None."""
     module = env.functional.network() if network is None else network
     blank = jnp.zeros((1, env.observation_size))
 
@@ -149,28 +146,22 @@ def brax_networks(
     return lambda *_, **__: PPONetworks(read(0), read(1), actions)
 
 
-def _replicated(tree: Any, devices: list[Any]) -> Any:
-    """``jax.device_put_replicated``, which brax 0.14.2 calls and jax 0.10 removed.
-
-    google/brax issue 671: fixed on its main branch, not in its newest release.
-    """
-    return jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
-
-
 @contextlib.contextmanager
 def repaired() -> Iterator[None]:
-    """Let released brax train under this JAX; all is as before afterwards."""
-    put = mock.patch.object(jax, "device_put_replicated", _replicated, create=True)
-    with put, jax.numpy_rank_promotion("allow"):
+    """Let released brax train under this JAX; all is as before afterwards. brax 0.14.2
+    calls ``jax.device_put_replicated``, which jax 0.10 removed (google/brax #671)."""
+
+    def put(tree: Any, devices: list[Any]) -> Any:
+        return jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
+
+    patch = mock.patch.object(jax, "device_put_replicated", put, create=True)
+    with patch, jax.numpy_rank_promotion("allow"):
         yield
 
 
 def train(env: EpisodeEnv, length: int, **arguments: Any) -> Any:
-    """brax's PPO on episodes of ``length`` decisions: what its ``train`` returns.
-
-    ``arguments`` of ``brax.training.agents.ppo.train`` go before those here, of which
-    brax's own defaults would not do: its discount is .9, its unrolls cut episodes.
-    """
+    """brax's PPO on episodes of ``length`` decisions: what its ``train`` returns, whose
+    ``arguments`` go before those here; its own defaults would cut episodes."""
     usual: dict[str, Any] = dict(
         environment=env, wrap_env_fn=wrap_fresh, network_factory=brax_networks(env),
         episode_length=length, unroll_length=length, discounting=1.0,

@@ -1,7 +1,6 @@
-"""Hyperparameters of a training: of PPO, how much an update plays, sizes of an episode.
+"""Hyperparameters: of PPO, how much an update plays, sizes of an episode.
 
-And what the fields of a configuration are: a default, the line that explains it, and
-its checks. Nothing here loads JAX, so that flags are read before.
+Fields have a default, a line of help and checks. Nothing here loads JAX.
 """
 
 from __future__ import annotations
@@ -10,14 +9,13 @@ import abc
 import dataclasses
 import importlib
 import importlib.util
-import itertools
 import pathlib
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform")
-"""Shapes of a cloud of candidates, see ``environments.scenarios``."""
+"""Shapes of a cloud of candidates, see ``environments.selection.mixture``."""
 
 _OWN = "jaxcal.own "  # before the path of a file, in the name of its module
 
@@ -66,11 +64,7 @@ def run_file(path: str | pathlib.Path, name: str) -> Any:
 
 
 def named(path: str) -> Any:
-    """What ``module:Name`` or ``file.py:Name`` names.
-
-    Raises:
-        ValueError: there is no such module or file, or no such name in it.
-    """
+    """What ``module:Name`` or ``file.py:Name`` names; else a ValueError."""
     place, _, name = path.rpartition(":")
     try:
         if place.endswith(".py"):
@@ -90,21 +84,8 @@ TRACED = (
     "value_error_limit", "entropy_start", "entropy_end", "discount", "gae_lambda",
     "advantage_limit", "max_grad_norm", "average_decay",
 )  # fmt: skip
-"""Fields of ``PPOConfig`` that a run may have as arrays, other than its
-configuration's: runs that differ in them are one program."""
-
-Sweep = tuple[tuple[str, tuple[float, ...]], ...]
-"""Values of fields in ``TRACED``; every combination is a run for each seed."""
-
-
-def runs_of(seed: int, num_seeds: int, sweep: Sequence[Any]) -> list[dict[str, Any]]:
-    """``seed`` and the swept values of each run that is trained side by side."""
-    names, values = [name for name, _ in sweep], [values for _, values in sweep]
-    return [
-        {"seed": seed + number} | dict(zip(names, held, strict=True))
-        for held in itertools.product(*values)
-        for number in range(num_seeds)
-    ]
+"""Fields of ``PPOConfig`` that ``make_train`` takes as arrays too: trainings that
+differ in them are one program."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,17 +130,6 @@ class PPOConfig(abc.ABC):
         limits = ("final_learning_rate", "warmup_updates", "advantage_limit")
         require(self, "0 or more", lambda v: v >= 0, *coefficients, *limits)
 
-    def require_sweep(self, sweep: Sweep) -> None:
-        """Refuse a sweep of what cannot be swept, or of values that break a rule."""
-        swept = [name for name, _ in sweep]
-        for name, values in sweep:
-            if swept.count(name) > 1:
-                raise ValueError(f"sweep must have each name once, got {name} twice")
-            if name not in TRACED:
-                raise ValueError(f"sweep must be of {', '.join(TRACED)}, got {name}")
-            for value in values:
-                dataclasses.replace(self, **{name: value})  # type: ignore[arg-type]
-
     def require_whole(self, budget: str, total: str, each: str) -> None:
         """Refuse a ``total`` that is not a multiple of ``each`` x num_minibatches."""
         require(self, "at least 1", lambda v: v >= 1, budget, total, each)
@@ -187,7 +157,6 @@ class PPOConfig(abc.ABC):
 
     @property
     def rows_per_minibatch(self) -> int:
-        """Rows of a minibatch, which the devices divide among them."""
         return self.rows_per_update // self.num_minibatches
 
 
@@ -247,33 +216,22 @@ class StreamsConfig(PPOConfig):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RunConfig(abc.ABC):
-    """What every run has beside what it trains: seeds, swept values, how often it
-    validates and saves. Subclasses have a field ``ppo``."""
+    """What every run has beside what it trains: seeds, how often it validates and
+    saves. Subclasses have a field ``ppo``."""
 
     seed: int = setting(0, "seed of all random numbers")
     num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
-    sweep: Sweep = ()  # side by side too: every combination, for every seed
     validate_every: float = 15.0  # seconds between validations
     save_every: float = 60.0  # seconds between checkpoints
 
     def __post_init__(self) -> None:
         require(self, "0 or more", lambda v: v >= 0, "seed")
         require(self, "at least 1", lambda v: v >= 1, "num_seeds")
-        ppo: PPOConfig = self.ppo  # type: ignore[attr-defined]  # of the subclass
-        ppo.require_sweep(self.sweep)
 
     @property
     @abc.abstractmethod
     def learners(self) -> tuple[Any, ...]:
         """Learners; update u trains number u modulo theirs."""
-
-    @property
-    def runs(self) -> list[dict[str, Any]]:
-        return runs_of(self.seed, self.num_seeds, self.sweep)
-
-    @property
-    def num_runs(self) -> int:
-        return len(self.runs)
 
     def as_meta(self) -> dict[str, Any]:
         """Plain JSON values; subclasses add theirs."""
@@ -281,15 +239,12 @@ class RunConfig(abc.ABC):
             "ppo": dataclasses.asdict(self.ppo),  # type: ignore[attr-defined]
             "seed": self.seed,
             "num_seeds": self.num_seeds,
-            "sweep": [[name, list(values)] for name, values in self.sweep],
         }
 
     @staticmethod
     def held_in(meta: Mapping[str, Any]) -> dict[str, Any]:
         """The fields that ``as_meta`` described, but for ``ppo``."""
-        sweep = tuple((name, tuple(values)) for name, values in meta.get("sweep", ()))
-        own = {name: meta[name] for name in ("seed", "num_seeds")}
-        return own | {"sweep": sweep}
+        return {name: meta[name] for name in ("seed", "num_seeds")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -308,9 +263,8 @@ class SelectionConfig:
     def __post_init__(self) -> None:
         require(self, "at least 1", lambda v: v >= 1, "num_inputs", "num_outputs")
         least, end = self.num_regressors, self.num_candidates
-        require(
-            self, f"in [{least}, {end})", lambda v: least <= v < end, "num_selected"
-        )
+        rule = f"in [{least}, {end})"
+        require(self, rule, lambda v: least <= v < end, "num_selected")
         require(self, "positive", lambda v: v > 0, "reward_scale")
 
     @property

@@ -1,8 +1,7 @@
 """Postures under Gymnasium's interfaces; importing this registers them.
 
-The environments of a batch are one JAX program. Observations, rewards and ends are
-numpy arrays; ``infos["action_mask"]`` says what may be chosen next, of one environment
-``action_masks()`` too, as sb3-contrib asks for it.
+The environments of a batch are one JAX program. ``infos["action_mask"]`` says what may
+be chosen next, of one environment ``action_masks()`` too, as sb3-contrib asks for it.
 """
 
 from __future__ import annotations
@@ -70,15 +69,9 @@ class JaxSingle(gymnasium.Env):
 
 
 class JaxVector(VectorEnv):
-    """A batch of any ``FunctionalEnv``.
-
-    Args:
-        env: of each.
-        num_envs: how many.
-        autoreset_mode: "SameStep": an episode that ends begins anew in the same step,
-            ``infos["final_obs"]`` and ``infos["final_info"]`` are of its end;
-            "NextStep": in the next one, whose action counts for nothing.
-    """
+    """A batch of any ``FunctionalEnv``. An episode that ends begins anew in the same
+    step ("SameStep"; ``infos["final_obs"]`` and ``infos["final_info"]`` are of its end)
+    or in the next one ("NextStep"), whose action counts for nothing."""
 
     def __init__(
         self,
@@ -97,8 +90,7 @@ class JaxVector(VectorEnv):
         self.single_action_space, self.single_observation_space = _spaces(env)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._reset = jax.jit(jax.vmap(env.begin))
-        self._look = jax.jit(jax.vmap(self._seen))
+        self._reset = jax.jit(jax.vmap(lambda key: self._shown(env.begin(key))))
         self._step = jax.jit(jax.vmap(self._one))
         self._key, self._state = jax.random.key(0), None
         self._ended = np.zeros(num_envs, bool)
@@ -109,10 +101,10 @@ class JaxVector(VectorEnv):
         if seed is not None:
             self._key = jax.random.key(seed)
         self._key, key = jax.random.split(self._key)
-        self._state = self._reset(jax.random.split(key, self.num_envs))
+        keys = jax.random.split(key, self.num_envs)
+        self._state, (obs, mask) = self._reset(keys)
         self._ended = np.zeros(self.num_envs, bool)
-        obs, mask = map(np.asarray, self._look(self._state))
-        return obs, {"action_mask": mask}
+        return np.asarray(obs), {"action_mask": np.asarray(mask)}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         if np.shape(actions) != (self.num_envs,):
@@ -137,20 +129,20 @@ class JaxVector(VectorEnv):
         infos = {"action_mask": mask, self._env.metric: metric}
         return infos | {f"_{name}": every for name in infos}
 
-    def _seen(self, state: Any) -> tuple[jax.Array, jax.Array]:
-        return self._env.observation(state), self._env.available(state)
+    def _shown(self, state: Any) -> tuple[Any, tuple[jax.Array, jax.Array]]:
+        return state, (self._env.observation(state), self._env.available(state))
 
     def _one(self, state: Any, ended: jax.Array, action: jax.Array) -> tuple[Any, ...]:
         """The state that goes on; observation and mask, those of the state stepped to;
         reward, done, metric."""
         after, reward, done, metric = self._env.advance(state, action)
-        last = self._seen(after)
+        _, last = self._shown(after)
         if not self._same_step:  # where the episode was over, this begins one
             reward, metric = (jnp.where(ended, 0.0, x) for x in (reward, metric))
             done = done & ~ended
         begins = done if self._same_step else ended
         state = renewed(self._env.begin, begins, after.key, after)
-        return state, self._seen(state), last, reward, done, metric
+        return *self._shown(state), last, reward, done, metric
 
 
 def _postures(sizes: dict[str, Any]) -> PosturesEnv:

@@ -1,7 +1,7 @@
 """Determinants and factors of small matrices, written out entry by entry in JAX.
 
-For matrices of 3 to 5 rows unrolled arithmetic is faster on a batch than a library's
-factorisation, and the same on every backend. All broadcast over leading axes.
+Of 3 to 5 rows this is faster on a batch than a library's factorisation, and the same on
+every backend. All broadcast over leading axes.
 """
 
 from __future__ import annotations
@@ -56,11 +56,9 @@ def solve_lower(lower: jax.Array, rows: jax.Array) -> jax.Array:
 
 
 def log_det_gram(postures: jax.Array, present: jax.Array | None = None) -> jax.Array:
-    """(...,) log-determinant of ``Z.T @ Z`` by Gram-Schmidt about the centroid.
-
-    Finite also where the postures (..., K, n) lie in one plane. ``present`` (..., K)
-    bool says which count, at least one; all of them by default.
-    """
+    """(...,) log-determinant of ``Z.T @ Z`` by Gram-Schmidt about the centroid; finite
+    also where the postures (..., K, n) lie in one plane. ``present`` (..., K) bool says
+    which count, at least one; all by default."""
     if present is None:
         present = jnp.ones(postures.shape[:-1], bool)
     weight = row_parts(present.astype(postures.dtype))
@@ -75,8 +73,7 @@ def log_det_gram(postures: jax.Array, present: jax.Array | None = None) -> jax.A
         for e in basis:
             along = row_dot(v, e)
             v = [x - along * y for x, y in zip(v, e, strict=True)]
-        square = row_dot(v, v)
-        square = jnp.maximum(square, _LEAST_SQUARE)
+        square = jnp.maximum(row_dot(v, v), _LEAST_SQUARE)
         factor = jax.lax.rsqrt(square)
         basis.append([x * factor for x in v])
         value = value + jnp.log(square)
@@ -92,11 +89,8 @@ def picked(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
 
 
 def row_parts(column: jax.Array) -> list[jax.Array]:
-    """A column (..., K) as K arrays (..., 1) where K <= 16, else as one array.
-
-    XLA's inner loop then runs over the batch, several times faster than over four rows.
-    Long columns are not split, because the program would grow with K.
-    """
+    """A column (..., K) as K arrays (..., 1) where K <= 16, else as one array: XLA's
+    inner loop then runs over the batch, several times faster than over four rows."""
     k = column.shape[-1]
     size = 1 if k <= _UNROLLED_ROWS else k
     return [column[..., i : i + size] for i in range(0, k, size)]

@@ -21,11 +21,9 @@ class Decision(NamedTuple):
 
 
 class _Keys(nn.Module):
-    """A linear map of candidates that is never applied to them.
-
-    A score ``q . (K.T p + b)`` is ``(K q) . p`` and a number that no softmax sees, and
-    a mean of keys is the key of the mean: the map is applied to a few queries instead.
-    """
+    """A linear map of candidates that is applied to a few queries instead: a score ``q
+    . (K.T p + b)`` is ``(K q) . p`` and a number that no softmax sees, and a mean of
+    keys is the key of the mean."""
 
     width: int
 
@@ -76,9 +74,8 @@ class Observing(Network):
 class PaperNetwork(Observing):
     """The paper's attention policy: hidden 768, 3.5 M parameters, 71 % shared.
 
-    Candidates are encoded one by one, a context encoder reads the ten numbers of the
-    state that are not candidates, attention relates the two, and an actor and a critic
-    stand on that shared encoder. Any M runs; it is not invariant to affine maps.
+    Candidates are encoded one by one, a context encoder reads the other ten numbers,
+    attention relates the two, and an actor and a critic stand on that shared encoder.
     """
 
     config: NetworkConfig

@@ -1,7 +1,6 @@
 """Products of learned features of the paper's 210 numbers; the kind ``observation``.
 
-Nothing here computes a gain, a projection or a determinant; sums of products of learned
-features can hold one, since it is linear in each of its rows. The chosen postures are
+Nothing here computes a gain, a projection or a determinant. The chosen postures are
 read one after another, ``h <- W (U h * V x)``, and candidates attend to one another by
 a power of a learned bilinear score. docs/policy.md says what each part brings.
 """
@@ -31,9 +30,8 @@ _SCALE = 12.0**0.5  # 1 / standard deviation of uniform commands in [0, 1]
 class ProductNetwork(Observing):
     """Products, attention and dense layers over the paper's observation.
 
-    Candidates that are not available are those that were chosen: all must be available
-    at first. Their order enters only as the order in which the chosen ones are read, of
-    which there are at most n. The value is 0: siblings are the baseline.
+    Candidates that are not available are those that were chosen, read in their order:
+    all must be available at first. The value is 0: siblings are the baseline.
     """
 
     config: NetworkConfig
@@ -56,12 +54,9 @@ class ProductNetwork(Observing):
         return jnp.concatenate([x, jnp.ones_like(x[..., :1])], -1)
 
     def decode(self, memory: jax.Array, decision: Decision) -> Scores:
-        """Scores of the next choice.
-
-        ``mirrored``: the network chooses from each of the 2^n mirror images of the set,
-        from the beginning; what most of them chose alike has the largest logits. Where
-        no image chose what is chosen already, the mean probability decides.
-        """
+        """Scores of the next choice; ``mirrored``: from each of the 2^n mirror images
+        of the set, what most of them choose from the beginning has the largest logits.
+        Where none chose what is chosen already, the mean probability decides."""
         x, available = memory, decision.available
         value = jnp.zeros(available.shape[:-1])
         if not self.config.mirrored:
@@ -82,9 +77,8 @@ class ProductNetwork(Observing):
         alike = (free[:, None] == free[None]).all(-1).sum(1)  # (2^n, ...) images
         fits = (available[None] | ~free).all(-1)  # chose what is chosen already
         votes = jnp.where(fits, (alike / len(signs)) ** 4, 0.0)[..., None] * ~free
-        return mask_logits(
-            jnp.log(votes.sum(0) + 1e-6 * mean + 1e-30), available
-        ), value
+        logits = jnp.log(votes.sum(0) + 1e-6 * mean + 1e-30)
+        return mask_logits(logits, available), value
 
     @nn.compact
     def _logits(self, x: jax.Array, available: jax.Array) -> jax.Array:
@@ -165,8 +159,7 @@ def _attention(
 ) -> tuple[jax.Array, jax.Array]:
     """Means (..., M, H p) of x (..., M, p), whose last column is 1, weighted by powers
     of squared scores with ``query`` (..., M, H p), and (..., M, H) log of the largest
-    of these; ``free`` (..., M) is 1 or 0, what is attended to.
-    """
+    of these; ``free`` (..., M) is 1 or 0, what is attended to."""
     *lead, m, _ = query.shape
     p = x.shape[-1]
     rows = query.reshape(*lead, -1, p)

@@ -133,8 +133,8 @@ def test_a_mesh_takes_the_devices_asked_for_and_names_what_does_not_divide() -> 
                 return str(error)
         out["many"] = error(lambda: devices.make_mesh(64, 9))
         out["odd"] = error(lambda: devices.make_mesh(12))
-        out["seeds"] = devices.make_mesh(7, num_runs=16).axis_names
-        out["odd seeds"] = error(lambda: devices.make_mesh(16, num_runs=6))
+        out["seeds"] = devices.make_mesh(7, num_seeds=16).axis_names
+        out["odd seeds"] = error(lambda: devices.make_mesh(16, num_seeds=6))
         devices.make_mesh(presets.load("paper").ppo.rows_per_minibatch)
         """,
     )
@@ -143,8 +143,8 @@ def test_a_mesh_takes_the_devices_asked_for_and_names_what_does_not_divide() -> 
     assert "multiple of the 8 devices, got 12" in str(out["odd"])
     assert "use 6 devices" in str(out["odd"]) and out["seeds"] == ["seeds"]
     assert out["odd seeds"] == (
-        "--seeds (times the values of --sweep) must be a multiple of the 8 devices, "
-        "got 6; use 6 devices (--devices 6)"
+        "--seeds must be a multiple of the 8 devices, got 6; "
+        "use 6 devices (--devices 6)"
     )
 
 
@@ -199,7 +199,7 @@ def test_seeds_on_devices_of_their_own_are_what_they_are_side_by_side() -> None:
         keys = jax.random.split(jax.random.key(5), 4)
         begin = jax.jit(jax.vmap(lambda key: ppo.begin(config, learner, key)))
         ends = []
-        for mesh in (None, devices.make_mesh(16, num_devices=2, num_runs=4)):
+        for mesh in (None, devices.make_mesh(16, num_devices=2, num_seeds=4)):
             state = devices.replicate(begin(keys), mesh)
             update = training.updates(config, learner, mesh, 2, 4)
             ends.append(update(state, jnp.int32(2)))

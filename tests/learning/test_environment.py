@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from jaxcal.information import regression
-from jaxcal.learning.environments import scenarios
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.selection import SelectionConfig
 
@@ -124,7 +123,7 @@ def test_thousands_of_episodes_step_at_once_and_compile_once(key):
 def test_candidates_come_from_a_pool_once_each(key, rng):
     config = SelectionConfig(num_candidates=30)
     pool = rng.normal(size=(40, 3)).astype(np.float32)
-    points, _ = scenarios.given(config, pool[None])(key)
+    points, _ = environment.given(config, pool[None])(key)
     rows = {tuple(row) for row in np.asarray(points)}
     assert len(rows) == 30 and rows <= {tuple(row) for row in pool}
 
@@ -148,19 +147,19 @@ def test_too_few_candidates_are_named():
     with pytest.raises(
         ValueError, match="num_candidates = 50 available candidates, got 10"
     ):
-        scenarios.given(config, np.zeros((1, 10, 3)))
+        environment.given(config, np.zeros((1, 10, 3)))
     free = np.ones((2, 50), bool)
     free[1, 3:] = False
     with pytest.raises(
         ValueError, match="num_selected = 4 available candidates, got 3"
     ):
-        scenarios.given(config, np.zeros((2, 50, 3)), free)
+        environment.given(config, np.zeros((2, 50, 3)), free)
 
 
-@pytest.mark.parametrize("shape", scenarios.SHAPES)
+@pytest.mark.parametrize("shape", environment.SHAPES)
 def test_every_shape_is_full_rank_and_masks_as_asked(shape, key):
     config = SelectionConfig()
-    draw = jax.jit(scenarios.mixture(config, (shape,), masked=0.3))
+    draw = jax.jit(environment.mixture(config, (shape,), masked=0.3))
     for one in jax.random.split(key, 5):
         points, available = draw(one)
         kept = np.asarray(points)[np.asarray(available)]
@@ -172,4 +171,4 @@ def test_every_shape_is_full_rank_and_masks_as_asked(shape, key):
 
 def test_unknown_shapes_are_refused():
     with pytest.raises(ValueError, match="torus"):
-        scenarios.mixture(SelectionConfig(), ("torus",))
+        environment.mixture(SelectionConfig(), ("torus",))

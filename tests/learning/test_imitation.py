@@ -118,7 +118,7 @@ def test_lessons_share_no_key_with_the_weights_and_the_updates():
 
 @jax.jit
 def measured(params, lesson):
-    learner = imitation.Imitation(LEARNER)
+    learner = imitation.Imitation(*vars(LEARNER).values())
     keys = jax.random.split(jax.random.key(0), len(lesson.best))
     attempt, _, _ = learner.rollout(params, learner.begin(keys, lesson), lesson)
     return learner.loss(params, attempt, jnp.int32(0))
@@ -181,7 +181,7 @@ def test_lessons_teach():
     network = build(NetworkConfig(width=8, encoder_rounds=1, lookahead=1))
     learner = Postures(config, Task(SelectionConfig(num_candidates=8)), network)
     state = ppo.begin(config, learner, jax.random.key(3))
-    update = updates(config, imitation.Imitation(learner))
+    update = updates(config, imitation.Imitation(*vars(learner).values()))
     losses = []
     for index in range(config.num_updates):
         shown = imitation.draw(learner, brute_force, key_of(index))

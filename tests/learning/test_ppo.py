@@ -289,7 +289,6 @@ class Probe:
     tasks: tuple[Pick, ...] = (Pick(),)
     seed: int = 3
     num_seeds: int = 1
-    sweep: tuple = ()
     validate_every: float = 15.0
     save_every: float = 60.0
 

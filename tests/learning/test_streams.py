@@ -128,7 +128,6 @@ class Config:
     environment: Late = Late()
     seed: int = 3
     num_seeds: int = 1
-    sweep: tuple = ()
     validate_every: float = 15.0
     save_every: float = 60.0
 
@@ -137,7 +136,7 @@ class Config:
         return (Streams(self.ppo, self.environment, Linear()),)
 
     def as_meta(self):
-        return {"num_seeds": self.num_seeds, "sweep": self.sweep}
+        return {"num_seeds": self.num_seeds}
 
 
 def recipe(config, task):
@@ -238,44 +237,6 @@ def test_a_damaged_checkpoint_is_put_aside_and_the_one_before_it_goes_on(tmp_pat
         np.testing.assert_array_equal(a, b)
     state, _ = checkpoint.restore(tmp_path, made.init(), "probe")
     assert int(state.num_updates) == 3  # written anew
-
-
-@pytest.mark.slow
-def test_swept_values_are_runs_of_their_own_in_one_program(tmp_path):
-    """Each is what a run with that value in its configuration is."""
-    config = dataclasses.replace(Config(), sweep=(("learning_rate", (1e-3, 3e-2)),))
-    task = jnp.float32(1.0)
-    both = run(recipe(config, task), tmp_path / "both")
-    for number, rate in enumerate((1e-3, 3e-2)):
-        alone = Config(dataclasses.replace(SHORT, learning_rate=rate))
-        state = run(recipe(alone, task), tmp_path / str(rate))
-        for a, b in zip(
-            *map(jax.tree.leaves, (both.params, state.params)), strict=True
-        ):
-            np.testing.assert_allclose(a[number], b, atol=1e-5)
-    metrics = np.genfromtxt(
-        tmp_path / "both" / "metrics.csv", delimiter=",", names=True
-    )
-    assert np.isfinite(metrics["clip_fraction"]).all()
-
-
-@pytest.mark.parametrize(
-    ("sweep", "says"),
-    [
-        (
-            (("num_epochs", (1.0, 2.0)),),
-            "sweep must be of learning_rate, .* got num_epochs",
-        ),
-        ((("clip_range", (0.2, -0.1)),), "clip_range must be positive, got -0.1"),
-        (
-            (("discount", (0.9,)), ("discount", (1.0,))),
-            "sweep must have each name once, got discount twice",
-        ),
-    ],
-)
-def test_what_cannot_be_swept_is_refused(sweep, says):
-    with pytest.raises(ValueError, match=says):
-        SHORT.require_sweep(sweep)
 
 
 def test_values_that_are_not_traced_are_refused():

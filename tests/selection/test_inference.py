@@ -263,9 +263,9 @@ def test_deciding_needs_no_jax():
 def test_commands_alone_have_jax_keep_compiled_code(tmp_path):
     code = (
         "import sys\n"
-        "from jaxcal.learning.runtime import cache\n"
+        "from jaxcal.learning.runtime import processes\n"
         "if 'late' in sys.argv: import jax\n"
-        "cache.keep_compiled_programs()\n"
+        "processes.keep_compiled_programs()\n"
         "print('jax' in sys.modules)\n"
         "import jax\n"
         "print(jax.config.jax_compilation_cache_dir)"

@@ -86,7 +86,7 @@ def train(
         OSError: the folder cannot be written.
     """
     rows = config.ppo.rows_per_minibatch
-    mesh = devices.make_mesh(rows, num_devices, config.num_runs)
+    mesh = devices.make_mesh(rows, num_devices, config.num_seeds)
     played = exercise(config)
     keys = jax.random.split(jax.random.key(_FRESH), _VALIDATED)
     task, base = played.task, played.base

@@ -1,9 +1,8 @@
 """Interface of a network that chooses postures.
 
-Features, which need no parameters, are separate from ``encode`` and ``decode``, so that
-training computes them once for a decision and not in every epoch. ``value`` is the
-expected final log det(Z.T Z), unscaled. M candidates of n inputs, K choices; leading
-axes ``...``.
+Features, which need no parameters, are computed once for a decision and not in every
+epoch. ``value`` is the expected final log det(Z.T Z), unscaled. M candidates of n
+inputs, K choices; leading axes ``...``.
 """
 
 from __future__ import annotations
@@ -46,15 +45,10 @@ class Network(nn.Module):
         available: jax.Array,
         count: jax.typing.ArrayLike,
     ) -> Any:
-        """Features of the decision after ``count`` choices.
-
-        Args:
-            features: from ``candidate_features``.
-            chosen: (..., K) int, -1 from ``count`` on.
-            available: (..., M) bool; of the first decision as ``usable`` of the set.
-            count: () choices made: the number 0, or traced, so that decisions share a
-                program.
-        """
+        """Features of the decision after ``count`` choices, of those of the set, of
+        ``chosen`` (..., K) int, -1 from ``count`` on, and ``available`` (..., M) bool,
+        at first as ``usable``. ``count`` is the number 0, or traced, so that decisions
+        share a program."""
         raise NotImplementedError(_OWN)  # abstract
 
     def encode(self, features: Any) -> jax.Array:
@@ -112,8 +106,6 @@ def decode(network: Network, params: Any, memory: jax.Array, decision: Any) -> A
 
 
 def mask_logits(logits: jax.Array, available: jax.Array) -> jax.Array:
-    """(..., M) logits, a large finite minimum where not available.
-
-    ``-inf`` would make the entropy, and with it every gradient, NaN.
-    """
+    """(..., M) logits, a large finite minimum where not available: ``-inf`` would make
+    the entropy, and with it every gradient, NaN."""
     return jnp.where(available, logits, jnp.asarray(-1e9, logits.dtype))

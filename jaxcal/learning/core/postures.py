@@ -1,10 +1,9 @@
 """Postures: episodes of K choices among M candidates, as PPO plays and scores them.
 
-A row is a fresh candidate set and G episodes on it. They share its features, its
-encoding and the first decision, whose baseline is the mean return of the others. Of the
-K choices the network learns the first T; its look-ahead makes the rest. With
-``explore_once`` a row's episodes have ``num_given`` choices in common, each draws and
-learns the next one and goes on greedily: T = 1.
+A row is a fresh candidate set and G episodes on it. They share its features, encoding
+and first decision, whose baseline is the mean return of the others. Of the K choices
+the network learns the first T; its look-ahead makes the rest. With ``explore_once`` T =
+1: they have ``num_given`` choices in common, learn the next one and go on greedily.
 """
 
 from __future__ import annotations
@@ -32,11 +31,9 @@ from jaxcal.learning.core.ppo import (
 
 
 class Episode(Protocol):
-    """The environment: one episode, as pure functions. Hashable.
-
-    A state is a tree of arrays; three of its leaves are ``candidates`` (M, n),
-    ``available`` (M,) bool and ``chosen`` (K,) int, -1 where nothing is chosen yet.
-    """
+    """The environment: one episode, as pure functions. Hashable. Leaves of a state are
+    ``candidates`` (M, n), ``available`` (M,) bool and ``chosen`` (K,) int, -1 where
+    nothing is chosen yet."""
 
     @property
     def num_decisions(self) -> int:
@@ -130,10 +127,9 @@ class Postures:
         """Play ``episodes_per_set`` episodes on a fresh set in each row: rows of
         decisions (T, G), the keys of the next update, metrics with ``rewards`` (B
         G,)."""
+        # Of the set, of the actions, of the next update.
         split = jax.vmap(lambda key: jax.random.split(key, 3))
-        keys = split(
-            jax.random.wrap_key_data(rollout_state)
-        )  # set, actions, next update
+        keys = split(jax.random.wrap_key_data(rollout_state))
         m = jax.eval_shape(self.task.reset, keys[0, 0]).available.shape[0]
         held = _at_once(self.config.episodes_per_set, m)  # episodes of a row at a time
         rows = _at_once(len(keys), m, held)
@@ -148,20 +144,16 @@ class Postures:
             "log_det_mean": log_det.mean(),
             "explained_variance": explained_variance(batch.target, value),
         }
-        return (
-            normalised(self.config, batch),
-            jax.random.key_data(keys[:, 2]),
-            metrics,
-        )
+        after = jax.random.key_data(keys[:, 2])
+        return normalised(self.config, batch), after, metrics
 
     def loss(
         self, params: Any, experience: Batch, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
         """PPO loss of whole episodes."""
         score = jax.vmap(functools.partial(self._score, params))
-        return surrogate(
-            self.config, *score(experience.observations), experience, update_index
-        )
+        scores = score(experience.observations)
+        return surrogate(self.config, *scores, experience, update_index)
 
     def _score(
         self, params: Any, observations: RowInputs
@@ -219,9 +211,9 @@ class Postures:
 
         def decide(state: Any, now: Any) -> tuple[Any, tuple[Any, ...]]:
             count, noise = now
-            learns = (
-                count < decided if 1 < decided < task.num_decisions else decided > 1
-            )
+            learns: Any = decided > 1
+            if 1 < decided < task.num_decisions:
+                learns = count < decided
             score_at = functools.partial(score, count=count, learns=learns)
             decision, logits, value = _mapped(score_at, at_once, state)
             state, record = jax.vmap(act)(state, logits, value, noise)
@@ -269,9 +261,8 @@ class Postures:
         rest = played["value"] - played["paid"]
         next_value = jnp.concatenate([rest[1:], jnp.zeros_like(rest[:1])])
         continues = jnp.ones_like(rest).at[-1].set(0.0)
-        advantage = advantages(
-            self.config, played["reward"], rest, next_value, continues
-        )
+        reward = played["reward"]
+        advantage = advantages(self.config, reward, rest, next_value, continues)
         target = advantage + played["value"]
         others = self.config.episodes_per_set - 1
         if others:

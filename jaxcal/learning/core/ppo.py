@@ -1,9 +1,7 @@
 """Proximal policy optimisation: loss, advantages, optimiser, update, training.
 
 A ``Learner`` plays and scores: ``postures`` has that of episodes of a fixed number of
-choices, ``streams`` that of sessions of any length. Everything here is pure;
-``training.run`` adds files, progress and a host.
-
+choices, ``streams`` that of sessions of any length. ``training.run`` adds files.
 Sources: Schulman et al. 2017 (clipped surrogate), 2016 (advantages).
 """
 
@@ -30,11 +28,8 @@ Metrics = dict[str, jax.Array]
 
 
 class Learner(Protocol):
-    """What is trained: it plays and it scores.
-
-    ``given`` are arrays that the caller passes through ``train`` or an update, such as
-    a task's tables: arguments, so that other values compile nothing.
-    """
+    """What is trained: it plays and it scores. ``given`` are arrays that go through
+    ``train`` or an update, such as a task's tables: other values compile nothing."""
 
     def __hash__(self) -> int:
         """Hashable: a static argument of ``jit``."""
@@ -78,12 +73,10 @@ def advantages(
     next_value: jax.Array,
     continues: jax.Array,
 ) -> jax.Array:
-    """(T, ...) generalised advantage estimates.
+    """(T, ...) generalised advantage estimates of arrays (T, ...).
 
     ``A_t = d_t + discount lambda continues_t A_(t+1)``, where ``d_t = reward_t +
-    discount next_value_t - value_t``. All are (T, ...): ``value`` before each decision,
-    ``next_value`` expected after it, ``continues`` 0 where an episode ends with it,
-    else 1.
+    discount next_value_t - value_t``; ``continues`` is 0 where an episode ends, else 1.
     """
     deltas = reward + config.discount * next_value - value
 
@@ -119,15 +112,9 @@ def surrogate(
     batch: Batch,
     update_index: jax.Array,
 ) -> tuple[jax.Array, Metrics]:
-    """Clipped surrogate, the value's error and an entropy bonus.
-
-    Args:
-        config: coefficients and limits.
-        logits: (B, T, ..., A), masked by a large finite minimum or -inf.
-        value: (B, T, ...) reward units.
-        batch: what was played.
-        update_index: () updates made; the entropy bonus follows it.
-    """
+    """Clipped surrogate, the value's error and an entropy bonus, which follows the
+    updates made: ``logits`` (B, T, ..., A), masked by a large finite minimum or -inf,
+    ``value`` (B, T, ...) in reward units."""
     log_probs = jax.nn.log_softmax(jnp.maximum(logits, _LEAST))
     taken = jnp.take_along_axis(log_probs, batch.action[..., None], axis=-1)[..., 0]
     log_ratio = taken - batch.log_prob
@@ -259,11 +246,8 @@ def mean_over(
     size: int,
     mesh: Mesh | None,
 ) -> Any:
-    """Mean of a function of rows, computed for ``size`` rows of each block at a time.
-
-    Rows have leaves (blocks, ...), spread over the mesh; ``index`` (blocks, n) says
-    which of each block, n a multiple of ``size``.
-    """
+    """Mean of a function of rows, leaves (blocks, ...), computed for ``size`` of each
+    block at a time; ``index`` (blocks, n) says which, n a multiple of ``size``."""
 
     def of_part(part: jax.Array) -> Any:
         pick = jax.vmap(lambda leaf, number: leaf[number])
@@ -285,17 +269,13 @@ class _Measured:
 def make_update(
     config: PPOConfig, learner: Learner, mesh: Mesh | None = None
 ) -> Callable[..., tuple[TrainState, Metrics]]:
-    """One update: play, then epochs of minibatches; pure, not compiled.
+    """One update, (state, *given) -> the next state and metrics: play, then epochs of
+    minibatches; pure, not compiled.
 
     On a mesh with the one axis ``sets`` every device plays some of the rows and keeps
     them: of each minibatch it draws an equal part from its own, and gradients alone are
-    summed over the devices.
-
-    An update in which a loss or a gradient is not finite is skipped: weights and
-    optimiser are as they were, and the metric ``skipped`` is 1; what is played goes on.
-
-    Returns:
-        (state, *given) -> the next state and metrics.
+    summed over the devices. Where a loss or a gradient is not finite, weights and
+    optimiser stay as they were and the metric ``skipped`` is 1; what is played goes on.
     """
     whole = mesh is not None or jax.default_backend() != "cpu"
     blocks = 1 if mesh is None else mesh.size

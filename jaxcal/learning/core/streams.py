@@ -1,10 +1,9 @@
 """Streams: sessions of any length played one after another, as experience for PPO.
 
-An update plays T further decisions of B streams. Where a stream is cut, the next update
-goes on; the value of that state closes the advantages. The value after a decision is
-the expectation over its possible outcomes, not that of the outcome drawn: the
-advantages have the same expectation without most of their variance. The task is an
-argument, as arrays: another one of the same shapes compiles nothing.
+An update plays T further decisions of B streams; the next goes on where they are cut.
+The value after a decision is the expectation over its possible outcomes, not that of
+the outcome drawn: the advantages have the same expectation without most of their
+variance.
 """
 
 from __future__ import annotations

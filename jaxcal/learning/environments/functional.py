@@ -1,8 +1,7 @@
 """Episodes for loops of one's own: the interface of gymnax 1.x.
 
-A step that ends an episode returns the first observation of a fresh one, drawn only
-where one of the batch has ended; ``info["action_mask"]`` says what may be chosen next.
-brax and Gymnasium see the same episodes through ``learning.brax`` and ``learning.gym``.
+A step that ends an episode returns the first observation of a fresh one. brax and
+Gymnasium see the same episodes through ``learning.brax`` and ``learning.gym``.
 """
 
 from __future__ import annotations
@@ -35,16 +34,13 @@ class EnvParams:
 
 
 def renewed(begin: Callable[[jax.Array], Any], done: Any, key: Any, after: Any) -> Any:
-    """``begin(key)`` where ``done``, else ``after``: a tree of arrays.
-
-    Under ``jax.vmap`` nothing begins while none of the batch is done.
-    """
+    """``begin(key)`` where ``done``, else ``after``: trees of arrays. Under ``vmap``
+    nothing begins while none of the batch is done."""
 
     @jax.custom_batching.custom_vmap
     def chosen(done: Any, key: Any, after: Any) -> Any:
-        return jax.tree.map(
-            lambda new, old: jnp.where(done, new, old), begin(key), after
-        )
+        where_done = functools.partial(jnp.where, done)
+        return jax.tree.map(where_done, begin(key), after)
 
     @chosen.def_vmap
     def of_batch(size: int, batched: Any, done: Any, key: Any, after: Any) -> Any:
@@ -123,17 +119,13 @@ class FunctionalEnv(abc.ABC):
         key = jax.random.key(0)
         return jax.eval_shape(lambda key: function(self.begin(key)), key)
 
-    def reset_env(
-        self, key: jax.Array, params: EnvParams | None = None
-    ) -> tuple[jax.Array, Any]:
+    def reset_env(self, key: jax.Array, params: Any = None) -> tuple[jax.Array, Any]:
         """Observation and state of a new episode."""
         state = self.begin(key)
         return self.observation(state), state
 
     @functools.partial(jax.jit, static_argnames="self")
-    def reset(
-        self, key: jax.Array, params: EnvParams | None = None
-    ) -> tuple[jax.Array, Any]:
+    def reset(self, key: jax.Array, params: Any = None) -> tuple[jax.Array, Any]:
         """Observation and state of a new episode."""
         return self.reset_env(key, params)
 
@@ -145,22 +137,17 @@ class FunctionalEnv(abc.ABC):
         action: jax.typing.ArrayLike,
         params: EnvParams | None = None,
     ) -> tuple[Any, ...]:
-        """One step, and a new episode after the last of one.
-
-        Returns:
-            Observation, state, () reward, () bool terminated, () bool truncated, and
-            info: ``action_mask`` (num_actions,) of the state that is returned, the
-            environment's ``metric`` (), ``terminated``, ``truncated``, and
-            ``final_observation``, of the episode that the step was made in.
-        """
+        """One step, and a new episode after the last of one: observation, state, ()
+        reward, () bool terminated, () bool truncated, and info: ``action_mask``
+        (num_actions,) of the state that is returned, the environment's ``metric`` (),
+        ``terminated``, ``truncated``, and ``final_observation``, of the episode that
+        the step was made in."""
         key_step, key_reset = jax.random.split(key)
-        last, after, reward, terminated, info = self.step_env(
-            key_step, state, action, params
-        )
+        stepped = self.step_env(key_step, state, action, params)
+        last, after, reward, terminated, info = stepped
         truncated = self.is_truncated(after, params)
-        obs, state = renewed(
-            self.reset_env, terminated | truncated, key_reset, (last, after)
-        )
+        over = terminated | truncated
+        obs, state = renewed(self.reset_env, over, key_reset, (last, after))
         info |= {"action_mask": self.available(state), "final_observation": last}
         info |= {"terminated": terminated, "truncated": truncated}
         return obs, state, reward, terminated, truncated, info
@@ -233,10 +220,7 @@ def _space_of(shape: Any) -> Any:
 
 
 class PosturesEnv(FunctionalEnv):
-    """Choose K of M postures.
-
-    Observation: (n M + M + 2 n + 4,) of ``selection.observe``, the paper's 210. Reward
-    and end: as ``selection.step``. Metric ``log_det``: the unscaled reward.
+    """Choose K of M postures, observed by ``selection.observe``: the paper's 210.
 
     Args:
         config: sizes and reward; 4 of 50 when None.

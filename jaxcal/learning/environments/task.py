@@ -1,7 +1,4 @@
-"""Task of a training: the selection environment and where its candidates come from.
-
-JAX is loaded when one is played.
-"""
+"""Task of a training: an environment and its candidates, without JAX until it plays."""
 
 from __future__ import annotations
 
@@ -22,8 +19,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class GivenCandidates:
-    """The user's own candidates; a checkpoint holds their digest, by which two are
-    equal."""
+    """The user's own; a checkpoint holds their digest, by which two are equal."""
 
     name: str = field(compare=False)  # of the file, for messages
     # (B, M, n) sets, or (1, N, n): a pool that every episode draws its M from. None
@@ -40,25 +36,21 @@ class GivenCandidates:
                     digest.update(f"{array.dtype.str} {array.shape}\n".encode())
                     digest.update(np.ascontiguousarray(array).tobytes())
             object.__setattr__(self, "sha256", digest.hexdigest())
-        elif not self.sha256:
-            raise ValueError("give the candidates: values or sha256, got neither")
 
     def source(self, config: SelectionConfig) -> CandidateSource:
         if self.values is None:
             raise ValueError(
                 f"this run was trained on {self.name}: pass that file with --candidates"
             )
-        from jaxcal.learning.environments import scenarios
+        from jaxcal.learning.environments import selection
 
-        return scenarios.given(config, self.values, self.available)
+        return selection.given(config, self.values, self.available)
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """An environment and where its candidates come from.
-
-    A subclass changes what is paid; a checkpoint holds its module and name.
-    """
+    """An environment and where its candidates come from; a subclass changes what is
+    paid, and a checkpoint holds its module and name."""
 
     environment: SelectionConfig = field(default_factory=SelectionConfig)
     shapes: tuple[str, ...] = ("uniform",)  # of config.SHAPES
@@ -68,21 +60,17 @@ class Task:
     given: GivenCandidates | None = None  # instead of shapes and masked
 
     def __post_init__(self) -> None:
-        require(
-            self,
-            f"in [0, {self.num_decisions})",
-            lambda v: 0 <= v < self.num_decisions,
-            "num_given",
-        )
+        most = self.num_decisions
+        require(self, f"in [0, {most})", lambda v: 0 <= v < most, "num_given")
 
     @property
     def draw(self) -> CandidateSource:
         """key -> (M, n) candidates and (M,) available."""
         if self.given is not None:
             return self.given.source(self.environment)
-        from jaxcal.learning.environments import scenarios
+        from jaxcal.learning.environments import selection
 
-        return scenarios.mixture(self.environment, self.shapes, self.masked)
+        return selection.mixture(self.environment, self.shapes, self.masked)
 
     @property
     def num_decisions(self) -> int:

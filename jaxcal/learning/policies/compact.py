@@ -24,11 +24,8 @@ _SHARP = 60.0  # inverse temperature of the choices that need no learning
 
 
 class _Dense(nn.Module):
-    """A dense layer on concatenated inputs, as a product of each with its kernel rows.
-
-    An input that all candidates of a set share, or all decisions on it, is then
-    multiplied once and not for each of them.
-    """
+    """A dense layer on concatenated inputs, as a product of each with its kernel rows:
+    one that all candidates of a set share is multiplied once."""
 
     width: int
 
@@ -51,9 +48,8 @@ class _Dense(nn.Module):
 class _Round(nn.Module):
     """One round of messages among the active candidates, then a residual MLP.
 
-    The message to candidate i is a linear attention with the kernel (x_i . x_j)^2:
-    ``sum_j (x_i . x_j)^2 v_j``, computed through the second moments of the whole set,
-    so that the cost grows with M and not with M squared.
+    The message to candidate i, ``sum_j (x_i . x_j)^2 v_j``, is computed through the
+    second moments of the whole set, so that the cost grows with M and not M squared.
     """
 
     width: int
@@ -77,9 +73,6 @@ class _Round(nn.Module):
 
 class CompactNetwork(Network):
     """Permutation-equivariant, affine-invariant, for any M, K and n.
-
-    Its inputs are functions of inner products of whitened regressors, so no affine map
-    of the commands and no order of the candidates changes the pick.
 
     The look-ahead makes the last two choices (``num_unlearned``): the best pair given
     the choices before, then the largest gain. At K = n + 2 the choices before the pair

@@ -1,9 +1,8 @@
 """Turning scores into a choice: greedy, sampled, best of the likeliest first picks.
 
-Written once over a ``Scorer``: the network in JAX (``policies.scorer``) is one, the
-compact network in numpy (``jaxcal.selection.policy.compact``) another. Needs no JAX.
-B candidate sets, E episodes (a set and the choices made from it), M candidates, K
-choices in all, p regressors of a candidate.
+A ``Scorer`` is the network in JAX (``policies.scorer``) or the compact one in numpy
+(``selection.policy.compact``). Needs no JAX. B candidate sets, E episodes (a set and
+the choices made from it), M candidates, K choices in all, p regressors of a candidate.
 """
 
 from __future__ import annotations
@@ -39,15 +38,9 @@ class Scorer(Protocol):
     def scores(
         self, memory: Any, chosen: Indices, free: Mask, count: int, best_only: bool
     ) -> Array:
-        """(E, M) unnormalised log-probabilities of the choice after ``count`` choices.
-
-        Args:
-            memory: of E episodes.
-            chosen: (E, K), -1 from ``count`` on.
-            free: (E, M) True where a candidate may be chosen.
-            count: choices made.
-            best_only: all but the largest may be too low where nothing is learned.
-        """
+        """(E, M) unnormalised log-probabilities of the choice after ``count`` choices,
+        of ``chosen`` (E, K), -1 from there on, and ``free`` (E, M). ``best_only``: all
+        but the largest may be too low where nothing is learned."""
 
     def worth(self, rows: Array, usable: Mask, tries: Indices) -> Array:
         """(B, T) by which the best of the tries (B, T, K) on each set is taken."""
@@ -64,7 +57,7 @@ def choose(
     num: int = 16,
     generators: Sequence[np.random.Generator] = (),
 ) -> Indices:
-    """Choose k of M candidates for every set of a batch.
+    """(B, k) of M candidates: the ``required`` first, then in the order of choice.
 
     Args:
         scorer: the network.
@@ -72,14 +65,9 @@ def choose(
         available: (B, M) bool.
         required: (B, r) distinct indices, chosen before the policy begins.
         k: candidates to choose in all.
-        decoding: ``greedy``: the likeliest at every step, one pass; ``samples``: the
-            best of ``num`` sampled passes; ``first``: the best of the ``num`` likeliest
-            first picks, each completed greedily.
-        num: passes for ``samples`` and ``first``.
-        generators: one a set, for ``samples``; else none.
-
-    Returns:
-        (B, k) required candidates first, then in the order of choice.
+        decoding: as for ``selection.policy.select_batch``, without "exchange".
+        num: passes for "samples" and "first".
+        generators: one a set, for "samples"; else none.
     """
     batch, r = required.shape
     chosen = np.full((batch, k), -1, np.int64)

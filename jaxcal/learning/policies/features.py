@@ -1,10 +1,9 @@
 """Inputs of the compact network: geometry of a candidate set and of a decision.
 
-Nothing here has parameters, so training computes it once for a decision and not in
-every epoch. The best subset does not change under an affine map of the commands, so
-the policy works on whitened regressors ``x_i`` (mean over the candidates of ``x x.T``
-is the identity). A choice is a projection: its direction is removed from every
-remaining ``x_i``, whose squared length is then the gain of choosing it.
+The best subset does not change under an affine map of the commands, so the policy works
+on whitened regressors ``x_i`` (mean over the candidates of ``x x.T`` is the identity).
+A choice is a projection: its direction is removed from every remaining ``x_i``, whose
+squared length is then the gain of choosing it.
 
 Shapes: M candidates, n inputs, p = n + 1, K choices; leading axes ``...``.
 """
@@ -29,27 +28,17 @@ _FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
 _RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
 _CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ
 
-AHEAD = ("gain", "best pair", "greedy triple", "greedy to the end")
-"""Choices that a look-ahead makes: 1, 2, 3 and all to the end."""
-FEATURES = (
-    *(f"half of {name}" for name in AHEAD),
-    *(f"exp of {name}" for name in AHEAD),
-    *(f"exp of 4 x {name}" for name in AHEAD),
-    "half of the squared length's log, less the mean's",
-    *(f"exp of {scale:g} x {AHEAD[-1]}" for scale in _CLOSE),  # with ``close_up``
-)
-"""Columns of a candidate; log-volumes ahead are relative to the best candidate's.
-``selection/policy/policy_kernel.py`` computes the same."""
-
 
 class VectorFeatures(NamedTuple):
-    """Inputs of the network from vectors y, one per candidate."""
+    """Inputs of the network from vectors y, one per candidate; those of numpy are in
+    ``selection/policy/policy_kernel.py``."""
 
-    columns: jax.Array  # (..., M, F) FEATURES, without close-ups all but the last three
+    columns: jax.Array  # (..., M, F) half of ``ahead``, exp of it, exp of 4 x it; half
+    # of the log square less the mean's; of close-ups exp of _CLOSE x the last of it
     moments: jax.Array  # (..., M, p (p + 1) / 2) products of coordinates, scaled so
     # that messages keep their size whatever M is
     active: jax.Array  # (..., M) bool, which candidates count
-    ahead: jax.Array  # (..., M, 4) AHEAD: log-volume after the greedy choices that
+    ahead: jax.Array  # (..., M, 4) log-volume after 1, 2, 3 and all greedy choices that
     # begin with this candidate, relative to the best candidate's
     best: jax.Array  # (..., 4) that of the best candidate
 
@@ -87,14 +76,9 @@ def decision_features(
 ) -> DecisionFeatures:
     """Features of the decision after ``count`` choices, one count for the whole batch.
 
-    Args:
-        features: of the set.
-        chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
-        available: (..., M) bool; at the number 0 of ``count`` those of the set itself,
-            whose look-ahead is then that of the decision.
-        count: () choices made; may be traced: one program serves every decision.
-        lookahead: most greedy choices to look ahead.
-        close_up: adds the columns that tell near-equal look-aheads apart.
+    Arguments are those of ``Network.decision_features``; ``lookahead`` is the largest
+    number of greedy choices ahead, ``close_up`` adds the columns that tell near-equal
+    look-aheads apart.
     """
     x = features.whitened
     p, total = x.shape[-1], chosen.shape[-1]
@@ -180,14 +164,9 @@ def _second_moments(x: jax.Array) -> jax.Array:
 
 
 def whiten(candidates: jax.Array, usable: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Whitened regressors of candidates (..., M, n), of which ``usable`` (..., M)
-    count.
-
-    Returns:
-        (..., M, n + 1) vectors x with mean ``x x.T = I`` over the usable candidates,
-        zero elsewhere, and (...,) the log-determinant of ``Z_s.T Z_s`` of a subset less
-        that of ``X_s.T X_s``.
-    """
+    """(..., M, n + 1) whitened regressors x of (..., M, n), with mean ``x x.T = I``
+    over the ``usable`` (..., M), zero elsewhere; and (...,) the log-determinant of
+    ``Z_s.T Z_s`` of any subset less that of ``X_s.T X_s``."""
     weight = usable.astype(candidates.dtype)
     number = jnp.maximum(weight.sum(-1), 1.0)
     mean = (weight[..., None] * candidates).sum(-2, keepdims=True)
@@ -204,14 +183,12 @@ def whiten(candidates: jax.Array, usable: jax.Array) -> tuple[jax.Array, jax.Arr
 def projected(
     x: jax.Array, chosen: jax.Array, count: jax.typing.ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
-    """Components of every vector x (..., M, p) orthogonal to the chosen ones.
+    """(..., M, p) components of every vector x orthogonal to the chosen ones, whose
+    squared lengths are the Schur-complement gains; and (...,) the log of the squared
+    volume that the chosen span, 0 where nothing is chosen.
 
     Of ``chosen`` (..., c, p), c <= p, the first ``count`` are chosen so far, the others
     zero. One in the span of those before it is not projected out again.
-
-    Returns:
-        (..., M, p), whose squared lengths are the Schur-complement gains; and (...,)
-        the log of the squared volume that the chosen span, 0 where nothing is chosen.
     """
     eye = jnp.eye(x.shape[-1], dtype=x.dtype)
 
@@ -237,24 +214,14 @@ def projected(
     return jnp.einsum("...mp,...pq->...mq", x, projection), volume
 
 
-def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
-    total = a[0] * b[0]
-    for left, right in zip(a[1:], b[1:], strict=True):
-        total = total + left * right
-    return total
-
-
 def normalised_by(
     x: jax.Array, chosen: jax.Array, ridge: jax.typing.ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
-    """Every vector x (..., M, p) in the metric of the ``chosen`` (..., c, p).
+    """(..., M, p) vectors y, x in the metric of the ``chosen`` (..., c, p): choosing i
+    multiplies det G by ``1 + |y_i|^2``; and (...,) log det G.
 
     ``|y_i|^2 = x_i.T G^-1 x_i``, ``G = C.T C + ridge I``; a ridge of 0 needs vectors
     that span the space, zeros among them count nothing.
-
-    Returns:
-        (..., M, p) vectors y: choosing i multiplies det G by ``1 + |y_i|^2``; and
-        (...,) log det G.
     """
     p = x.shape[-1]
     gram = jnp.einsum(
@@ -283,11 +250,9 @@ def lookahead(
 
     Returns:
         Four arrays (..., M): the log of the factor by which the determinant grows over
-        the first 1, 2, 3 and ``depth`` choices, all of them where there are fewer; -30
-        where not active. The first is the gain. The second is the gain of the best
-        pair, exactly; later ones are what greedy choices reach. Cost: ``depth - 1``
-        products of (M, p) with (p, M). Of more than 1,024 candidates only the 512 of
-        largest gain are looked ahead from, as in
+        the first 1 (the gain), 2 (the best pair, exactly), 3 and ``depth`` choices, all
+        of them where there are fewer; -30 where not active. Of more than 1,024
+        candidates only the 512 of largest gain are looked ahead from, as in
         ``selection/policy/policy_kernel.py``: of the others all but the first are -30.
     """
     m, p = y.shape[-2:]
@@ -317,7 +282,9 @@ def lookahead(
         back = (metric * picked[..., None, :]).sum(-1)
         size = jnp.maximum((back * picked).sum(-1), _LEAST_GAIN)
         shrink = 1.0 / (base + size)
-        inner = _dot([back[..., i, None] for i in range(p)], parts)
+        inner = back[..., 0, None] * parts[0]
+        for i in range(1, p):
+            inner = inner + back[..., i, None] * parts[i]
         gains = gains - inner * inner * shrink[..., None]
         gains = jnp.where(column == newest[..., None], _TAKEN, gains)
         along = back[..., :, None] * back[..., None, :]

@@ -1,9 +1,8 @@
 """Configuration of a network of postures, and the kinds of network there are.
 
-A network of one's own is a class, or its name: ``module:Name`` or ``file.py:Name``; it
-is a ``core.network.Network``, which has this configuration if it has a field
-``config``. An installed package adds a kind by an entry point in the group
-``jaxcal.networks``.
+A network of one's own is a ``core.network.Network``, or its name: ``module:Name`` or
+``file.py:Name``; it has this configuration if it has a field ``config``. An installed
+package adds a kind by an entry point in the group ``jaxcal.networks``.
 """
 
 from __future__ import annotations

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,16 +18,16 @@ from jaxcal.learning.policies import decoding as decoders
 from jaxcal.learning.small_matrices import log_det_gram
 
 
+@dataclasses.dataclass(frozen=True)
 class NetworkScorer:
     """The ``decoding.Scorer`` of a ``Network`` and its parameters."""
 
-    piece_rows = None  # XLA has threads of its own
-
-    def __init__(self, network: Network, params: Any) -> None:
-        self._network, self._params = network, params
+    piece_rows: ClassVar[None] = None  # XLA has threads of its own
+    network: Network
+    params: Any
 
     def encode(self, rows: NDArray[Any], usable: NDArray[np.bool_]) -> Any:
-        return _encoded(self._network, self._params, rows[..., :-1], usable)
+        return _encoded(self.network, self.params, rows[..., :-1], usable)
 
     def part(self, memory: Any, sets: NDArray[np.int64]) -> Any:
         return memory
@@ -39,14 +40,14 @@ class NetworkScorer:
         count: int,
         best_only: bool = False,
     ) -> NDArray[Any]:
-        learned = chosen.shape[1] - count > self._network.num_unlearned
+        learned = chosen.shape[1] - count > self.network.num_unlearned
         tries = len(chosen) // len(jax.tree.leaves(memory)[0])  # in a row on each set
         choices, available = (
             array.reshape(-1, tries, array.shape[-1])
             for array in (chosen.astype(np.int32), free)
         )
         scores = scores_of(
-            self._network, self._params, memory, choices, available, count, learned
+            self.network, self.params, memory, choices, available, count, learned
         )
         return np.asarray(scores).reshape(free.shape)
 

@@ -2,8 +2,7 @@
 
 Keys are split for every set of the whole job before anything is placed, so an update
 draws the same numbers on one device and on many; only the order of sums differs. With
-several seeds each device trains some of them. With one device there is no mesh.
-Process 0 alone reads and writes files; ``on_first`` sends what it read to the others.
+several seeds each device trains some of them. Process 0 alone reads and writes files.
 """
 
 from __future__ import annotations
@@ -25,19 +24,11 @@ T = TypeVar("T")
 
 
 def make_mesh(
-    rows: int, num_devices: int | None = None, num_runs: int = 1
+    rows: int, num_devices: int | None = None, num_seeds: int = 1
 ) -> Mesh | None:
     """All devices of the job on the axis ``sets``, or ``seeds`` if several are trained;
-    None for one device.
-
-    Args:
-        rows: sets or streams of a minibatch.
-        num_devices: devices of each process; all when None.
-        num_runs: trained side by side: seeds, swept values.
-
-    Raises:
-        ValueError: a process has fewer, or they do not divide the rows or seeds evenly.
-    """
+    None for one device. ``num_devices`` of each process, all when None, that do not
+    divide the rows of a minibatch, or the seeds, evenly are refused."""
     have = jax.local_device_count()
     number = have if num_devices is None else num_devices
     if not 1 <= number <= have:
@@ -47,44 +38,39 @@ def make_mesh(
         chosen += [d for d in jax.devices() if d.process_index == process][:number]
     if len(chosen) == 1:
         return None
-    shared = rows
-    what = (
-        "episodes_per_update / (episodes_per_set x num_minibatches), the sets of a "
-        "minibatch (of a task decisions_per_update / (stream_length x num_minibatches))"
-    )
-    if num_runs > 1:
-        shared, what = num_runs, "--seeds (times the values of --sweep)"
+    shared, what = num_seeds, "--seeds"
+    if num_seeds == 1:
+        shared = rows
+        what = (
+            "episodes_per_update / (episodes_per_set x num_minibatches), or of a task "
+            "decisions_per_update / (stream_length x num_minibatches),"
+        )
     if shared % len(chosen):
         fewer = max(n for n in range(1, len(chosen)) if shared % n == 0)
         raise ValueError(
             f"{what} must be a multiple of the {len(chosen)} devices, got {shared}; "
             f"use {fewer} devices (--devices {fewer})"
         )
-    return Mesh(np.asarray(chosen), ("seeds" if num_runs > 1 else "sets",))
+    return Mesh(np.asarray(chosen), ("seeds" if num_seeds > 1 else "sets",))
 
 
-def a_device_for_each_core(num_runs: int) -> None:
-    """Make CPU cores devices of JAX: the largest number that divides ``num_runs``.
-
-    Each core then trains its seeds independently. Does nothing where JAX is initialised
-    or ``XLA_FLAGS`` sets the number of devices.
-    """
+def a_device_for_each_core(num_seeds: int) -> None:
+    """Make CPU cores devices of JAX, as many as divide ``num_seeds``: each then trains
+    its own. Does nothing where JAX is initialised or ``XLA_FLAGS`` sets the number."""
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     cores = range(1, (os.cpu_count() or 1) + 1)
-    number = max(core for core in cores if num_runs % core == 0)
+    number = max(core for core in cores if num_seeds % core == 0)
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", number)
 
 
 def describe(mesh: Mesh | None) -> str:
     """The devices in words: "cpu", "8 x NVIDIA H100 in 2 processes"."""
-    text = str(jax.devices()[0].device_kind)
-    if mesh is not None:
-        text = f"{mesh.size} x {text}"
-    if jax.process_count() > 1:
-        text += f" in {jax.process_count()} processes"
-    return text
+    number = "" if mesh is None else f"{mesh.size} x "
+    several = jax.process_count() > 1
+    where = f" in {jax.process_count()} processes" if several else ""
+    return f"{number}{jax.devices()[0].device_kind}{where}"
 
 
 def is_first() -> bool:
@@ -100,18 +86,18 @@ def on_first(function: Callable[[], T]) -> T:
     answer: Any = None
     if is_first():
         try:
-            answer = (True, function())
+            answer = function()
         except (ValueError, OSError) as error:
-            answer = (False, error)
+            answer = error
     data = np.frombuffer(pickle.dumps(answer), np.uint8)
     with collective():
         size = int(multihost_utils.broadcast_one_to_all(np.int32(data.size)))
         buffer = data if is_first() else np.zeros(size, np.uint8)
         data = np.asarray(multihost_utils.broadcast_one_to_all(buffer), np.uint8)
-    fine, result = pickle.loads(data.tobytes())
-    if not fine:
-        raise result
-    return result
+    answer = pickle.loads(data.tobytes())
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
 
 
 def any_process(flag: bool) -> bool:

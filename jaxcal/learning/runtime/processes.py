@@ -1,9 +1,7 @@
 """A job of several processes, which run the same command: how one joins and leaves.
 
-It learns of the others from ``--coordinator``, ``--num-processes`` and
-``--process-id``, or from what JAX finds under SLURM, Open MPI, Kubernetes and on Cloud
-TPU. When a process dies, JAX ends the others after ``HEARTBEAT_SECONDS``; checkpoints
-stay.
+It learns of the others from its flags, or from what JAX finds under SLURM, Open MPI,
+Kubernetes and on Cloud TPU. When one dies, JAX ends the others; checkpoints stay.
 """
 
 from __future__ import annotations
@@ -12,17 +10,22 @@ import argparse
 import contextlib
 import dataclasses
 import os
+import pathlib
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, ClassVar
 
-from jaxcal.arguments import Parser, values_of
+from jaxcal.arguments import Parser, refused, values_of
 
 EXIT_LOST = 3  # another process of the job is gone
 HEARTBEAT_SECONDS = 20  # silence after which a process counts as lost
 _CONNECT_SECONDS = 300  # for all processes to come together
 _LEAVE_SECONDS = 3600  # for process 0 to write its files when the others are done
+_LAUNCHERS = (  # what those that JAX knows set in each process that they start
+    *("SLURM_STEP_NODELIST", "OMPI_COMM_WORLD_SIZE", "JOB_COMPLETION_INDEX"),
+    *("JAX_COORDINATOR_ADDRESS", "MEGASCALE_COORDINATOR_ADDRESS"),
+)
 
 
 @dataclasses.dataclass
@@ -34,8 +37,8 @@ class Job:
     coordinator: Annotated[
         str | None, "address of process 0, the same in every process", "HOST:PORT"
     ] = None
-    num_processes: int | None = None
-    process_id: Annotated[int | None, "0 to N - 1", "I"] = None
+    num_processes: Annotated[int | None, (1,)] = None
+    process_id: Annotated[int | None, "0 to N - 1", "I", (0,)] = None
 
 
 def expected(job: Job, environ: Mapping[str, str] = os.environ) -> bool:
@@ -44,34 +47,21 @@ def expected(job: Job, environ: Mapping[str, str] = os.environ) -> bool:
     if number == 1:
         return False
     if address is number is process_id is None:
-        return _cluster(environ)
+        if "1" in map(environ.get, ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE")):
+            return False
+        # The slice of a Cloud TPU machine is in its metadata, which only JAX reads.
+        tpu = any(map(os.path.exists, ("/dev/accel0", "/dev/vfio/0")))
+        tpu |= "," in environ.get("TPU_WORKER_HOSTNAMES", "")
+        return tpu or any(name in environ for name in _LAUNCHERS)
     if address is None or number is None or process_id is None:
         raise ValueError(
             "--coordinator, --num-processes and --process-id must come together"
         )
-    if number < 1:
-        raise ValueError(f"--num-processes must be at least 1, got {number}")
-    if not 0 <= process_id < number:
+    if process_id >= number:
         raise ValueError(f"--process-id must be in [0, {number}), got {process_id}")
     if not re.fullmatch(r".+:\d+", address):
         raise ValueError(f"--coordinator must be HOST:PORT, got {address!r}")
     return True
-
-
-def _cluster(environ: Mapping[str, str]) -> bool:
-    """Whether a launcher that JAX knows started several of these processes."""
-    if environ.get("SLURM_NTASKS", "1") != "1":
-        # A batch script has SLURM_NTASKS too, but runs outside any job step.
-        return "SLURM_STEP_NODELIST" in environ
-    if environ.get("OMPI_COMM_WORLD_SIZE", "1") != "1":
-        return True
-    if "," in environ.get("TPU_WORKER_HOSTNAMES", ""):
-        return True
-    several = ("JAX_COORDINATOR_ADDRESS", "MEGASCALE_COORDINATOR_ADDRESS")
-    if any(name in environ for name in (*several, "JOB_COMPLETION_INDEX")):
-        return True
-    # The slice of a Cloud TPU machine is in its metadata, which only JAX reads.
-    return any(map(os.path.exists, ("/dev/accel0", "/dev/vfio/0")))
 
 
 def run_job(
@@ -85,8 +75,7 @@ def run_job(
         if not expected(job):
             return work()
     except (ValueError, argparse.ArgumentError) as error:
-        print(f"{program}: {error}", file=sys.stderr)
-        return 2
+        return refused(program, error)
 
     import jax
 
@@ -96,10 +85,8 @@ def run_job(
         if code == 0 and jax.distributed.is_initialized():
             sys.stdout.flush()
             jax.distributed.shutdown()  # without it the process counts as lost
-            return code
     except ValueError as error:
-        print(f"{program}: {error}", file=sys.stderr)
-        code = 2
+        code = refused(program, error)
     except RuntimeError as error:  # what a collective raises
         line = (str(error).splitlines() or ["no reason given"])[0][:200]
         print(f"{program}: job aborted ({line}); {advice}", file=sys.stderr)
@@ -113,10 +100,8 @@ def run_job(
 
 @contextlib.contextmanager
 def collective() -> Iterator[None]:
-    """Raise RuntimeError where a collective fails because another process is gone.
-
-    JAX's transport raises ValueError, which commands report as a wrong argument.
-    """
+    """Raise RuntimeError where a collective fails because another process is gone; JAX
+    raises ValueError, which commands report as a wrong argument."""
     import jax
 
     try:
@@ -150,3 +135,24 @@ def _connect(job: Job) -> None:
             f"not every process connected to {job.coordinator or 'the coordinator'} in "
             f"{_CONNECT_SECONDS} s: {str(error).splitlines()[0][:120]}"
         ) from None
+
+
+def keep_compiled_programs() -> None:
+    """Have JAX cache compiled code on disk, so that a second command starts sooner: in
+    the folder that the user has set, else in ``jaxcal/jax`` under ``XDG_CACHE_HOME`` or
+    ``~/.cache``. Only commands turn it on; does not load JAX."""
+    # jaxlib 0.10.1 logs an error for each program that it takes from the cache if the
+    # processor has hints that XLA does not list as features; the results are correct.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # read when JAX is loaded
+    home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    settings = {
+        "jax_compilation_cache_dir": str(pathlib.Path(home) / "jaxcal" / "jax"),
+        # Small programs too: a start has a hundred of them.
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": 0,
+    }
+    for name, value in settings.items():
+        os.environ.setdefault(name.upper(), str(value))  # read when JAX is loaded
+        jax = sys.modules.get("jax")
+        if jax and not (name.endswith("dir") and getattr(jax.config, name)):
+            jax.config.update(name, value)

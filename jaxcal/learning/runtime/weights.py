@@ -1,8 +1,8 @@
 """Paths of checkpoints, and a policy as one plain file; needs no JAX and no orbax.
 
 A weights file (``.npz``) holds the weights by flat name (``encoder_0.mix.kernel``) and
-``header``: JSON with format, version, the fields of the ``NetworkConfig``, the
-checkpoint's meta and the SHA-256 of network and weights, by which damage is found.
+``header``: JSON with format, version, network, the checkpoint's meta and the SHA-256 of
+network and weights, by which damage is found.
 """
 
 from __future__ import annotations
@@ -37,11 +37,8 @@ def shipped(name: str = "default") -> pathlib.Path:
 
 
 def locate(checkpoint: str | pathlib.Path | None) -> pathlib.Path:
-    """Path of a weights file, or of the newest complete step of a run.
-
-    ``checkpoint``: a weights file, a training run's folder, its checkpoint folder or a
-    step in that; the policy of postures that ships when None.
-    """
+    """Path of a weights file, or of the newest complete step of a run; ``checkpoint``
+    may also be a run's checkpoint folder or a step in that, None what ships."""
     path = shipped() if checkpoint is None else pathlib.Path(checkpoint)
     if path.is_file() or (path / "meta" / "metadata").is_file():
         return path
@@ -78,13 +75,8 @@ def write(path: str | pathlib.Path, weights: Weights) -> None:
     if not str(path).endswith(".npz"):
         raise ValueError(f"the exported policy must be one file NAME.npz, got {path}")
     pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
-    header = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "sha256": weights.fingerprint,
-        "network": weights.network,
-        "meta": weights.meta,
-    }
+    header = {"format": _FORMAT, "version": _VERSION, "sha256": weights.fingerprint}
+    header |= {"network": weights.network, "meta": weights.meta}
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
     arrays: dict[str, Any] = {"header": text, **weights.arrays}
     with atomic_write(path) as file:
@@ -92,8 +84,7 @@ def write(path: str | pathlib.Path, weights: Weights) -> None:
 
 
 def read(path: str | pathlib.Path) -> Weights:
-    """Read a weights file; CheckpointError where it is damaged or of another
-    version."""
+    """Read a weights file; CheckpointError where damaged or of another version."""
     data = pathlib.Path(path).read_bytes()
     try:
         with np.load(io.BytesIO(data)) as file:
@@ -115,10 +106,8 @@ def read(path: str | pathlib.Path) -> Weights:
 
 
 def require_trained_by_d(path: str | pathlib.Path, meta: dict[str, Any]) -> None:
-    """Refuse a policy that an earlier jaxcal trained by A, I or E.
-
-    Removes the field ``criterion`` of its network and environments, which is gone.
-    """
+    """Refuse a policy that an earlier jaxcal trained by A, I or E; removes the field
+    ``criterion`` of its network and environments, which is gone."""
     tasks = (task["environment"] for task in meta.get("tasks", ()))
     for held in (meta.get("network", {}), *tasks):
         if (criterion := held.pop("criterion", "D")) != "D":

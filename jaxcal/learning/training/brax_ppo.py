@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -29,6 +29,9 @@ _READ = {  # fields of PPOConfig that brax is given: brax's names
     "clip_range": "clipping_epsilon",
     "max_grad_norm": "max_grad_norm",
 }
+READ = {*_READ, "num_episodes", "seed", "width"} | {
+    field.name for field in settings_of(SelectionConfig)
+}
 
 
 def adapted(config: TrainConfig) -> TrainConfig:
@@ -40,15 +43,6 @@ def adapted(config: TrainConfig) -> TrainConfig:
     ppo = dataclasses.replace(config.ppo, learning_rate=rate, num_episodes=episodes)
     network = NetworkConfig(kind="paper", width=width)
     return dataclasses.replace(config, network=network, ppo=ppo)
-
-
-def require_read(given: Collection[str]) -> None:
-    """Refuse values of fields, by name, that brax's trainer would not read."""
-    read = {*_READ, "num_episodes", "seed", "width"}
-    read |= {field.name for field in settings_of(SelectionConfig)}
-    if unread := sorted(set(given) - read):
-        flags = ", ".join("--" + name.replace("_", "-") for name in unread)
-        raise ValueError(f"--trainer brax does not use {flags}: leave it out")
 
 
 def train(

@@ -3,8 +3,7 @@
 A run's folder ``checkpoint`` holds one numbered folder per save: ``policy`` (the
 averaged weights), ``state`` (what else a resumed run needs) and ``meta`` (JSON: schema,
 configuration, package versions, progress). Orbax writes a step beside the others and
-renames it, so a kill during a save leaves the previous one. orbax calls this interface
-legacy; it is used here alone.
+renames it, so a kill during a save leaves the previous one.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ import orbax.checkpoint as ocp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from jaxcal.extras import versions
-from jaxcal.learning.config import runs_of
 from jaxcal.learning.core.network import Network, initial
 from jaxcal.learning.core.ppo import TrainState
 from jaxcal.learning.policies.networks import NetworkConfig, build
@@ -75,16 +73,9 @@ def save(
     meta: dict[str, Any],
     state: TrainState | None = None,
 ) -> None:
-    """Add a step to a checkpoint folder, of which the newest three are kept.
-
-    Args:
-        folder: made where missing.
-        step: number of the step; a step that exists is left as it is.
-        policy: the averaged weights.
-        meta: JSON values: a configuration, and its ``schema`` if not ``SCHEMA``.
-        state: of the run, whose averaged weights are ``policy``; None for a policy that
-            cannot be resumed.
-    """
+    """Add a step to a checkpoint folder, of which the newest three are kept; one that
+    exists is left as it is. ``policy`` are the averaged weights, ``meta`` JSON values.
+    Without ``state`` a policy cannot be resumed."""
     root = pathlib.Path(folder)
     root.mkdir(parents=True, exist_ok=True)
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -196,13 +187,8 @@ def _unreadable(path: pathlib.Path, what: str, error: Exception) -> CheckpointEr
 def read_meta(
     checkpoint: str | pathlib.Path | None, schema: str = SCHEMA
 ) -> tuple[pathlib.Path, dict[str, Any]]:
-    """A weights file or the newest complete step of a run, and its meta, checked.
-
-    ``checkpoint`` as of ``weights.locate``; ``schema`` is the one that it must have.
-
-    Raises:
-        CheckpointError: there is none, it is damaged, or holds something else.
-    """
+    """A weights file or the newest complete step of a run (``weights.locate``), and its
+    meta; a CheckpointError where there is none, it is damaged, or of another schema."""
     path = locate(checkpoint)
     if path.is_file():
         meta = weights.read(path).meta
@@ -247,23 +233,21 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
     """The weights in a file or a step's folder, of the shapes of ``like``, one
     policy's; with several seeds the best."""
     what = "read: its weights are damaged or do not fit the network"
-    runs = len(runs_of(0, meta.get("num_seeds", 1), meta.get("sweep", ())))
+    seeds = meta.get("num_seeds", 1)
     if path.is_file():
         arrays = weights.read(path).arrays
         params = jax.tree.map(jax.numpy.asarray, unflatten_dict(arrays, sep="."))
         wanted = flatten_dict(like, sep=".")
         if jax.tree.map(np.shape, arrays) != jax.tree.map(lambda x: x.shape, wanted):
             raise CheckpointError(f"checkpoint {path} cannot be {what}")
-    elif runs == 1:
+    elif seeds == 1:
         params = _read(path / "policy", like, what)
     else:
-        several = jax.tree.map(
-            lambda leaf: jax.ShapeDtypeStruct((runs, *leaf.shape), leaf.dtype), like
+        stacked = jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct((seeds, *leaf.shape), leaf.dtype), like
         )
-        best = meta["progress"]["best"]
-        params = jax.tree.map(
-            lambda leaf: leaf[best], _read(path / "policy", several, what)
-        )
+        every, best = _read(path / "policy", stacked, what), meta["progress"]["best"]
+        params = jax.tree.map(lambda leaf: leaf[best], every)
     for name, array in flatten_dict(params, sep=".").items():
         if not np.isfinite(array).all():
             raise CheckpointError(
@@ -275,11 +259,8 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
 def restore(
     folder: str | pathlib.Path, fresh: TrainState, schema: str = SCHEMA
 ) -> tuple[TrainState, dict[str, Any]]:
-    """The training state of the newest whole step, and its meta.
-
-    A damaged step is warned of and renamed, and the one before it is read. ``fresh`` is
-    a state of the same structure, for shapes and types.
-    """
+    """The training state of the newest whole step, and its meta; ``fresh`` is one of
+    the same shapes. A damaged step is renamed, warned of, and the one before read."""
     newest = locate(folder)
     if not newest.name.isdigit():  # weights alone
         return _restored(newest, fresh, schema)
@@ -319,7 +300,5 @@ def _restored(
             return leaf
         return jax.random.wrap_key_data(leaf, impl=jax.random.key_impl(like))
 
-    rest["rollout_state"] = jax.tree.map(
-        typed, rest.pop("playing"), fresh.rollout_state
-    )
-    return TrainState(average=average, **rest), meta
+    playing = jax.tree.map(typed, rest.pop("playing"), fresh.rollout_state)
+    return TrainState(average=average, rollout_state=playing, **rest), meta

@@ -1,11 +1,10 @@
 """The run that trains a policy of postures: its validation, and its warm start.
 
-That is imitation of a teacher. A lesson is a batch of candidate sets with the postures
-that a teacher, such as the exact solver, would choose. The loss of a decision is minus
-the log of the probability that the policy gives to *any* posture of the wanted ones
-that is not chosen yet: their order does not matter. The wanted one with the largest
-logit is then chosen. Where postures are given, the wanted are those and their best
-completion.
+That is imitation: a lesson is a batch of candidate sets with the postures that a
+teacher, such as the exact solver, would choose. The loss of a decision is minus the log
+of the probability that the policy gives to *any* of the wanted ones that is not chosen
+yet; that of the largest logit is then chosen. Where postures are given, the wanted are
+those and their best completion.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ import numpy as np
 import optax
 from flax import struct
 
-from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.core.network import Network, decode, encode, mask_logits
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.core.ppo import Learner, Metrics, TrainState
@@ -120,25 +118,14 @@ class Attempt:
 
 
 @dataclasses.dataclass(frozen=True)
-class Imitation:
+class Imitation(Postures):
     """The learner of what a teacher chooses; it is given a ``Lesson``."""
 
-    postures: Postures
-
-    def with_config(self, config: EpisodesConfig) -> Imitation:
-        return Imitation(self.postures.with_config(config))
-
-    def init(self, key: jax.Array, lesson: Lesson) -> Any:
-        return self.postures.init(key)
-
-    def begin(self, keys: jax.Array, lesson: Lesson) -> Any:
-        return self.postures.begin(keys)
-
-    def rollout(
+    def rollout(  # type: ignore[override]  # of a lesson
         self, params: Any, rollout_state: Any, lesson: Lesson
     ) -> tuple[Attempt, Any, Metrics]:
         """Play the lesson: each choice is the policy's likeliest wanted posture."""
-        task, network = self.postures.task, self.postures.network
+        task, network = self.task, self.network
         features = network.candidate_features(lesson.candidates, lesson.available)
         memory = encode(network, params, features)
         m, learned = lesson.available.shape[-1], task.num_decisions
@@ -170,13 +157,12 @@ class Imitation:
         )
         return attempt, rollout_state, {}
 
-    def loss(
+    def loss(  # type: ignore[override]  # of an attempt
         self, params: Any, experience: Attempt, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
         """Cross-entropy to the wanted postures, and the value's error; metrics are
         named as those of PPO."""
-        attempt, config = experience, self.postures.config
-        network = self.postures.network
+        attempt, config, network = experience, self.config, self.network
         memory = encode(network, params, attempt.features)
         decide = functools.partial(decode, network, params, memory)
         of_each = jax.vmap(decide, in_axes=1, out_axes=1)
@@ -187,7 +173,7 @@ class Imitation:
         def mean(array: jax.Array) -> jax.Array:
             return (array * attempt.weight).mean()
 
-        error = self.postures.task.value_scale * (value - attempt.best[:, None])
+        error = self.task.value_scale * (value - attempt.best[:, None])
         square = 2.0 * optax.losses.huber_loss(error, delta=config.value_error_limit)
         metrics = {
             "policy_loss": -mean(jax.nn.logsumexp(wanted_log_probs, axis=-1)),
@@ -209,9 +195,8 @@ class Validation:
 
     def measure(self, network: Network, params: Any, k: int) -> tuple[float, float]:
         """Mean det S / det S* and the share of optima hit, by greedy decoding."""
-        candidates = np.asarray(self.candidates, np.float32)
-        everything = np.ones(candidates.shape[:2], bool)
-        free = everything if self.available is None else self.available
+        candidates, free = np.asarray(self.candidates, np.float32), self.available
+        free = np.ones(candidates.shape[:2], bool) if free is None else free
         indices = scorer.choose(network, params, candidates, free, k=k)
         gap = np.asarray(scorer.log_det_of(candidates, indices)) - self.best
         # float32 values against a float64 optimum: equal to a few units in the last
@@ -232,10 +217,9 @@ def train(
     num_devices: int | None = None,
     **rest: Any,
 ) -> TrainState:
-    """Train until the budget is spent or ``should_stop`` says so, and save.
-
-    All devices take part. In a job of several processes each calls this with the same
-    configuration; the first alone touches ``folder``, validates and reports.
+    """Train until the budget is spent or ``should_stop`` says so, and save: the last
+    state; with several seeds each leaf has a leading axis of them. In a job of several
+    processes the first alone touches ``folder``, validates and reports.
 
     Args:
         config: the run.
@@ -245,12 +229,9 @@ def train(
         num_updates: stop after this update instead of at the end of the budget.
         num_devices: devices of each process; all when None.
         rest: ``resume``, ``report`` and ``should_stop`` of ``training.run.run``.
-
-    Returns:
-        The last state; with several seeds each leaf has a leading axis of them.
     """
     rows = config.ppo.rows_per_minibatch
-    mesh = devices.make_mesh(rows, num_devices, config.num_runs)
+    mesh = devices.make_mesh(rows, num_devices, config.num_seeds)
     learners = config.learners
     network, k = build(config.network), config.tasks[0].num_decisions
     last = config.ppo.num_updates if num_updates is None else num_updates
@@ -274,7 +255,8 @@ def train(
 
     def imitate(index: int) -> tuple[Learner, Lesson]:
         learner = learners[index % len(learners)]
-        return Imitation(learner), lessons.at(index)
+        imitation = Imitation(learner.config, learner.task, learner.network)
+        return imitation, lessons.at(index)
 
     def validate(average: Any) -> dict[str, float]:
         assert validation is not None  # else it is not called

@@ -142,12 +142,10 @@ def load(name: str) -> TrainConfig:
 
 
 def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
-    """A configuration with single fields changed, in whichever part they are.
-
-    An environment field is changed in every task, and refused where tasks differ in it.
-    Where more than n + 1 postures are asked for, the reward becomes the increase of log
-    det S (``reward_gain``), so that an episode is paid what it is judged by.
-    """
+    """A configuration with single fields changed, in whichever part they are; in every
+    task, refused where tasks differ in it. Where more than n + 1 postures are asked
+    for, the reward becomes the increase of log det S, so that an episode is paid what
+    it is judged by."""
     fields = {field.name for part in PARTS.values() for field in settings_of(part)}
     for name in sorted(set(values) - fields):
         raise ValueError(f"no configuration has the field {name}")

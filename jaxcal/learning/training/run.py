@@ -1,9 +1,8 @@
 """The loop of a training run: files, resume, validation, progress, devices.
 
-A run folder holds ``metrics.csv`` (a row per update; means over runs side by side),
-``seeds.csv`` (every validation of each of several), ``last_rewards.npy`` (the last
-1,000 rewards of the first task) and ``checkpoint/``. The loop is on the host, over
-calls of several updates, so that a signal stops it between two.
+A run folder holds ``metrics.csv`` (a row per update; means over seeds),
+``last_rewards.npy`` (the last 1,000 rewards of the first task) and ``checkpoint/``. The
+loop is on the host, over calls of several updates, so that a signal stops it between.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaxcal.files import atomic_write, write_text
 from jaxcal.jsonlines import flock
-from jaxcal.learning.config import PPOConfig, runs_of
+from jaxcal.learning.config import PPOConfig
 from jaxcal.learning.core import ppo
 from jaxcal.learning.core.ppo import Learner, TrainState
 from jaxcal.learning.runtime import devices
@@ -64,26 +63,19 @@ class Recipe:
     def learners(self) -> tuple[Learner, ...]:
         return tuple(self.config.learners)
 
-    @functools.cached_property
-    def runs(self) -> list[dict[str, Any]]:
-        config = self.config
-        return runs_of(config.seed, config.num_seeds, config.sweep)
+    @property
+    def seeds(self) -> list[int]:
+        first = self.config.seed
+        return list(range(first, first + self.config.num_seeds))
 
     def init(self) -> TrainState:
-        """The state before the first update, from seeds and swept values alone."""
+        """The state before the first update, from the seeds alone."""
 
-        def begin(key: jax.Array, values: dict[str, jax.Array]) -> TrainState:
-            ppo, learner = self.config.ppo, self.learners[0]
-            return _begun(ppo, learner, key, *self.given, **values)
+        def begin(key: jax.Array) -> TrainState:
+            return _begun(self.config.ppo, self.learners[0], key, *self.given)
 
-        keys = jnp.stack([jax.random.key(run["seed"]) for run in self.runs])
-        values = {
-            name: jnp.array([run[name] for run in self.runs], jnp.float32)
-            for name, _ in self.config.sweep
-        }
-        if len(self.runs) == 1:
-            return begin(keys[0], {name: value[0] for name, value in values.items()})
-        return jax.vmap(begin)(keys, values)
+        keys = jnp.stack([jax.random.key(seed) for seed in self.seeds])
+        return begin(keys[0]) if len(keys) == 1 else jax.vmap(begin)(keys)
 
 
 # One program for every seed; eager, it would compile two hundred small ones.
@@ -112,13 +104,9 @@ def updates(
 ) -> Callable[..., tuple[TrainState, ppo.Metrics]]:
     """Several updates in one compiled call; nothing is compiled for another seed.
 
-    Args:
-        config, learner: as for ``ppo.make_update``.
-        mesh: axis ``sets``: the devices share every update; axis ``seeds``: each device
-            trains some of the seeds by itself.
-        at_most: updates of a call.
-        seeds: runs side by side, each leaf of the state with a leading axis of so many;
-            0 for one run without that axis.
+    On a mesh with axis ``sets`` the devices share every update, with axis ``seeds``
+    each trains some of the seeds by itself. Of several ``seeds`` each leaf of the state
+    has a leading axis of so many; 0 for one without that axis.
 
     Returns:
         (state, count, *given) -> the state after ``count <= at_most`` updates, and
@@ -168,10 +156,8 @@ def updates(
 
 
 def _compiler_options() -> dict[str, Any]:
-    """Options of XLA: LLVM's level 2 on a CPU, unless ``XLA_FLAGS`` has a level.
-
-    An update compiles in four fifths of the time of level 3; it runs 2 % slower.
-    """
+    """LLVM's level 2 on a CPU, unless ``XLA_FLAGS`` has a level: an update compiles in
+    four fifths of the time of level 3 and runs 2 % slower."""
     level = "xla_backend_optimization_level"
     if jax.default_backend() != "cpu" or level in os.environ.get("XLA_FLAGS", ""):
         return {}
@@ -206,9 +192,9 @@ def run(
     """
     last = recipe.config.ppo.num_updates if num_updates is None else num_updates
     root = pathlib.Path(folder)
-    seeds = len(recipe.runs) if len(recipe.runs) > 1 else 0
+    seeds = len(recipe.seeds) if len(recipe.seeds) > 1 else 0
     count, timed, broken = 1, False, ""
-    in_row = np.zeros(len(recipe.runs), int)  # updates skipped
+    in_row = np.zeros(len(recipe.seeds), int)  # updates skipped
     with contextlib.ExitStack() as held:
         if devices.is_first():
             held.enter_context(_locked(root))
@@ -294,15 +280,11 @@ class _Recorder:
         first = ("update", recipe.config.ppo.unit, "seconds", "reward_mean")
         columns = (*first, *recipe.columns, *_LOSSES, *recipe.measured)
         self._rows = _Table(self.root / "metrics.csv", self.reported, columns)
-        self._seeds: _Table | None = None
-        if len(recipe.runs) > 1:
-            columns = ("update", *recipe.runs[0], *recipe.measured)
-            self._seeds = _Table(self.root / "seeds.csv", self.reported, columns)
         self._begun = self._validated = self._noted = time.perf_counter()
         self._saved = -np.inf  # soon after the beginning too
         self._of_seeds: list[dict[str, float]] = []  # of the last validation
-        self._skipped, self._judged = 0, 0
-        self._judging_s = 0.0  # the last validation, the first apart: it compiles
+        self._skipped = 0
+        self._judging_s: list[float] = []  # of each validation; the first compiles
 
     def note(
         self,
@@ -338,33 +320,27 @@ class _Recorder:
         recipe, config = self.recipe, self.recipe.config
         done, now = int(row["update"]), time.perf_counter()
         pause = config.validate_every  # 0: every update
-        if pause:  # validation has at most a tenth of the time
-            pause = max(pause, 9.0 * self._judging_s)
+        if pause and self._judging_s[1:]:  # validation has at most a tenth of the time
+            pause = max(pause, 9.0 * self._judging_s[-1])
         due = now - self._validated > pause
         if not due and done not in (1, self.last):
             return
         spread: dict[str, float] = {}
         if recipe.validate is not None:
-            average, several = devices.local(state.average), self._seeds is not None
-            policies = [average]
-            if several:
+            average = devices.local(state.average)
+            policies, number = [average], len(recipe.seeds)
+            if number > 1:
                 policies = [
-                    jax.tree.map(lambda x, i=i: x[i], average)
-                    for i in range(len(recipe.runs))
+                    jax.tree.map(lambda x, i=i: x[i], average) for i in range(number)
                 ]
             self._of_seeds = [recipe.validate(policy) for policy in policies]
             for name in self._of_seeds[0]:
                 values = [seed[name] for seed in self._of_seeds]
                 row[name] = float(np.mean(values))
-                spread[name] = float(np.std(values, ddof=1)) if several else 0.0
-            if self._seeds is not None:
-                for run, measured in zip(recipe.runs, self._of_seeds, strict=True):
-                    self._seeds.add({"update": done} | run | measured)
+                spread[name] = float(np.std(values, ddof=1)) if number > 1 else 0.0
         rate = (done - self.reported) / max(now - self._validated, 1e-9)
         self._validated, self.reported = time.perf_counter(), done
-        if self._judged:
-            self._judging_s = self._validated - now
-        self._judged += 1
+        self._judging_s.append(self._validated - now)
         self.report(
             Report(
                 update=done,
@@ -391,7 +367,7 @@ class _Recorder:
             "seconds": self._seconds(time.perf_counter()),
             "device": jax.devices()[0].device_kind,
         }
-        if len(recipe.runs) > 1:
+        if len(recipe.seeds) > 1:
             scores = [seed[recipe.measured[0]] for seed in self._of_seeds]
             progress["best"] = int(np.argmax(scores)) if scores else 0
             progress["seeds"] = self._of_seeds
@@ -400,8 +376,7 @@ class _Recorder:
         checkpoint.save(self.root / "checkpoint", done, state.average, meta, state)
 
     def close(self) -> None:
-        for table in filter(None, (self._rows, self._seeds)):
-            table.close()
+        self._rows.close()
 
 
 def _begin(

@@ -37,7 +37,7 @@ class Memory(NamedTuple):
 class _Decision(NamedTuple):
     """What ``describe`` writes, and the candidates that count."""
 
-    features: Array32  # (E, M, F) ``learning.policies.features.FEATURES``
+    features: Array32  # (E, M, F) as ``VectorFeatures.columns``
     moments: Array32  # (E, p (p + 1) / 2, M)
     ahead: Array  # (E, M)
     active: Array32  # (E, M) 1 or 0
