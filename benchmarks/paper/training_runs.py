@@ -47,7 +47,7 @@ def collect(run: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
         OSError: the run holds no metrics.csv, or ``out`` cannot be written.
         ValueError: a file of the run cannot be understood.
     """
-    from jaxcal.evaluation.training_figure import read_metrics
+    from jaxcal.evaluation.figures import read_metrics
 
     metrics = read_metrics(run / "metrics.csv")
     summary = _summary(run)

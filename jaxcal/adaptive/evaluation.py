@@ -85,7 +85,7 @@ class DeciderEvaluation(Evaluation):
             f"{self.task}{f' ({shown})' if shown else ''}, seed {self.seed}: "
             f"{sessions:,} sessions, information gained in nats",
             (
-                ("method", lambda row: row.method),
+                ("method", lambda row: row.result.method),
                 ("nats", lambda row: _interval(row.numbers["nats"], "")),
                 (
                     f"less {rival}, paired",

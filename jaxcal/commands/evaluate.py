@@ -8,20 +8,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
-from jaxcal.arguments import (
-    Parser,
-    exit_code,
-    several,
-    told,
-    typed_line,
-    values_of,
-)
+from jaxcal.arguments import Parser, exit_code, several, told, typed_line, values_of
 from jaxcal.extras import needs
 from jaxcal.files import require_kept, require_writable_folder, write_text
 
@@ -35,15 +27,9 @@ _POOLED = 1000  # episodes drawn of one table
 
 _DESCRIPTION = """\
 Every method chooses K postures in every episode of a dataset. The table compares the
-determinant of their information matrix S with that of the best choice (S*).
-
-columns:
-  mean, median det S  larger is better; in the unit of the dataset's commands
-  det S/det S*        mean over the episodes; 1 is optimal
-  hit rate            share of episodes in which the optimum was found
-  D-eff.              mean of (det S/det S*)^(1/p), p parameters (12 for 3 x 3)
-  x random            mean det S divided by that of random selection (paper)
-  time each           seconds per selection, mean of the batch, no compilation
+determinant of their information matrix S with that of the best choice (S*), as means
+over the episodes: det S/det S*, the share of optima found (hit rate), (det S/det
+S*)^(1/p) of p parameters (D-eff.), det S over that of random selection (x random).
 """
 
 _EPILOG = """\
@@ -52,13 +38,10 @@ methods:
   policy:samples      the best of --num random selections of the network
   policy:first        the best after each of the --num most likely first postures
   policy:exchange     policy, then Fedorov exchange from its selection
-  policy:all          all four, a row each
   random              --draws selections per episode, all counted
   greedy              adds the posture of the largest gain, K times
   exchange            Fedorov exchange with random restarts
   exact               the proven optimum
-  auto                default of `select`: the cheapest way to a proven D-efficiency
-                      of 0.999; runs only when named
 
 datasets:
   dataset1 to 5       the paper's, drawn with --seed (200,000, 1,000, 100, 100 and 1
@@ -71,15 +54,10 @@ examples:
       the shipped policy and every baseline on 1,000 unseen sets of 50 postures
   {program} --checkpoint runs/a runs/b --methods policy,exact --json out.json
       two trainings side by side, numbers as JSON
-  {program} --dataset dataset3 mine.npz --report report
-      figures and report/index.html; dataset3 has outputs: parameters are fitted too
-  {program} --methods random,greedy,exact --k 8 --episodes 100
-      eight of fifty postures; loads no JAX
+  {program} --dataset dataset3 mine.npz --k 8 --report report
+      eight of fifty postures of two datasets; figures and report/index.html
   {program} --task knee
       deciders of sequential measurement; {program} --task knee --help
-  {program} --stream runs/ten_million --episodes 10000000
-      any number of episodes in constant memory; the same command resumes, and the
-      same command on another machine shares the work
 """
 
 
@@ -159,7 +137,7 @@ class EvaluateOptions(Outputs):
     dataset: Annotated[tuple[str, ...], "datasets; dataset2", "NAME|FILE"] = ()
     recordings: Annotated[Path | None, "dataset4.csv, dataset5.csv", "DIR"] = None
     methods: Annotated[
-        list[str] | None, "default: all but auto", "A,B", several(str, "names")
+        list[str] | None, "default: all", "A,B", several(str, "names")
     ] = None
     k: Annotated[int, "postures to choose", "K", (1,)] = 4
     episodes: Annotated[int | None, "at most the first N of each", (1,)] = None
@@ -173,44 +151,18 @@ class EvaluateOptions(Outputs):
         (1e-3,),
     ] = None
     indices: Annotated[bool, "add the chosen postures to the JSON"] = False
-    run: Annotated[
-        tuple[Path, ...],
-        "training runs to draw learning curves of, besides those of --checkpoint",
-        "DIR",
-    ] = ()
-    stream: Annotated[
-        Path | None,
-        "evaluate in parts kept in DIR, which can be resumed: any number of --episodes",
-        "DIR",
-    ] = None
 
     @property
     def checkpoints(self) -> list[str | None]:
         """Each once; None is the shipped one."""
         return [*dict.fromkeys(self.checkpoint)] or [None]
 
-    @property
-    def datasets(self) -> list[str]:
-        """Each once."""
-        return [*dict.fromkeys(self.dataset)] or ["dataset2"]
-
 
 def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> int:
-    """Evaluate, print, write.
-
-    Args:
-        argv: the command line; that of the process when None.
-        prog: what was typed before it, for messages and the record.
-
-    Returns:
-        The exit code.
-    """
+    """Evaluate, print, write; the exit code. ``prog`` is what was typed."""
     words = list(sys.argv[1:] if argv is None else argv)
     command = ["python", prog] if prog.endswith(".py") else prog.split()
     flags = {word.partition("=")[0] for word in words}
-    kept = "nothing was written"
-    if "--stream" in flags and "--task" not in flags:
-        kept = "finished parts are kept; run the same command again to resume"
 
     def run() -> None:
         made = parser(prog, typed_line(prog), "--task" in flags).parse_args(words)
@@ -220,11 +172,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
         with told():
             made.function(options)
 
-    before = signal.signal(signal.SIGTERM, _terminate)
-    try:
-        return exit_code(run, prog, kept)
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    return exit_code(run, prog, "nothing was written")
 
 
 def parser(prog: str, typed: str, of_task: bool = False) -> Parser:
@@ -233,9 +181,9 @@ def parser(prog: str, typed: str, of_task: bool = False) -> Parser:
         more = _EPILOG.format(program=typed)
         return Parser(prog=prog, description=_DESCRIPTION, epilog=more).of(_run)
     with needs("policy", "--task"):
-        from jaxcal.learning.runtime import cache
+        from jaxcal.learning.runtime import processes
 
-        cache.keep_compiled_programs()  # before JAX is loaded
+        processes.keep_compiled_programs()  # before JAX is loaded
         from jaxcal.adaptive.evaluation import METHODS
         from jaxcal.adaptive.tasks import registry
 
@@ -250,14 +198,8 @@ def _listed(abouts: Mapping[str, str]) -> str:
     return "\n".join(f"  {name:10} {about}" for name, about in abouts.items())
 
 
-def _terminate(number: int, frame: object) -> NoReturn:
-    """SIGTERM ends the command as Ctrl-C does."""
-    raise KeyboardInterrupt("terminated")
-
-
 def _run(options: EvaluateOptions) -> None:
     from jaxcal.evaluation.methods import DEFAULT_METHODS, POLICIES, check_methods
-    from jaxcal.progress import Progress
 
     asked = DEFAULT_METHODS if options.methods is None else options.methods
     methods = check_methods(asked)
@@ -268,43 +210,46 @@ def _run(options: EvaluateOptions) -> None:
                 f"{','.join(methods)}"
             )
         with needs("policy", "--checkpoint"):  # it may need JAX
-            from jaxcal.learning.runtime import cache
-        cache.keep_compiled_programs()
-    _check_outputs(options)
-    evaluated = _whole if options.stream is None else _streamed
-    progress = Progress(quiet=options.quiet)
-    runs = _run_folders(options.run, options.checkpoints)
-    whole = evaluated(options, methods, progress)
-    _show(
-        options, whole, "jaxcal.evaluation.figures:evaluation_figures", progress, runs
-    )
+            from jaxcal.learning.runtime import processes
+        processes.keep_compiled_programs()
+    options.require_writable()
+    evaluated = functools.partial(_evaluations, options, methods)
+    figures = "jaxcal.evaluation.figures:evaluation_figures"
+    _show(options, evaluated, figures, _run_folders(options.checkpoints))
 
 
 def _show(
     options: Outputs,
-    evaluated: Iterator[tuple[Summary, Evaluation | None]],
+    evaluated: Callable[[Progress], Iterator[tuple[Summary, Evaluation]]],
     figures: str,
-    progress: Progress,
     runs: Sequence[Path] = (),
 ) -> None:
     from jaxcal.evaluation.report import json_document, text_table, write_report
+    from jaxcal.progress import Progress
 
+    progress = Progress(quiet=options.quiet)
     summaries: list[Summary] = []
     whole: list[Evaluation] = []
     try:
-        for summary, evaluation in evaluated:
+        for summary, evaluation in evaluated(progress):
             progress.clear()
             if summaries:
                 print()
             print(text_table(summary), flush=True)
             summaries.append(summary)
-            whole += [] if evaluation is None else [evaluation]
+            whole.append(evaluation)
     finally:
         progress.clear()
     if options.report is not None:
         module, _, name = figures.partition(":")
         draw = getattr(importlib.import_module(module), name)
-        count = write_report(options.report, whole, draw, runs, command=options.command)
+        curves = {}
+        if runs:
+            from jaxcal.evaluation.figures import training_curves
+
+            curves["training_curves"] = training_curves({run.name: run for run in runs})
+        folder, command = options.report, options.command
+        count = write_report(folder, whole, draw, curves, command=command)
         drawn = "1 figure" if count == 1 else f"{count} figures"
         print(f"saved: {options.report}/index.html and {drawn}")
     if options.json is not None:
@@ -313,13 +258,14 @@ def _show(
         print(f"saved: {options.json}")
 
 
-def _whole(
+def _evaluations(
     options: EvaluateOptions, methods: Sequence[str], progress: Progress
 ) -> Iterator[tuple[Summary, Evaluation]]:
     """Every dataset, read or made before the first is evaluated."""
     from jaxcal.evaluation.methods import evaluate
 
-    for dataset in [_dataset(name, options) for name in options.datasets]:
+    names = [*dict.fromkeys(options.dataset)] or ["dataset2"]
+    for dataset in [_dataset(name, options) for name in names]:
         evaluation = evaluate(
             dataset,
             options.k,
@@ -356,66 +302,19 @@ def _dataset(name: str, options: EvaluateOptions) -> Dataset:
     return dataset if options.episodes is None else dataset.part(0, options.episodes)
 
 
-def _streamed(
-    options: EvaluateOptions, methods: Sequence[str], progress: Progress
-) -> Iterator[tuple[Summary, None]]:
-    assert options.stream is not None  # it was given
-    from jaxcal.evaluation.methods import evaluate_stream
-    from jaxcal.paper.datasets import drawn
-
-    whole = {
-        "--report": options.report is not None,
-        "--indices": options.indices,
-        "--time-limit": options.time_limit is not None,
-    }
-    for flag in (flag for flag, value in whole.items() if value):
-        raise ValueError(f"{flag} needs all episodes in memory: not with --stream")
-    if len(options.datasets) > 1:
-        raise ValueError(
-            f"--stream takes one dataset, got {', '.join(options.datasets)}"
-        )
-    if options.episodes is None:
-        raise ValueError("--stream needs --episodes")
-    (name,) = options.datasets
-    plan = {
-        "dataset": name,
-        "seed": options.seed,
-        "k": options.k,
-        "methods": methods,
-        "checkpoints": options.checkpoints,
-        "num": options.num,
-        "random_draws": options.draws,
-    }
-    draw = functools.partial(drawn, name, options.seed)
-    yield evaluate_stream(draw, options.episodes, options.stream, plan, progress), None
-
-
-def _check_outputs(options: EvaluateOptions) -> None:
-    options.require_writable()
-    if options.stream is not None:
-        require_writable_folder(options.stream)
-    for folder in options.run:
-        if not (folder / "metrics.csv").is_file():
-            raise ValueError(f"--run {folder} holds no metrics.csv")
-        if options.report is None:
-            raise ValueError("--run draws training curves and needs --report")
-
-
-def _run_folders(given: Sequence[Path], checkpoints: list[str | None]) -> list[Path]:
-    found = list(given)
-    for checkpoint in filter(None, checkpoints):
-        folder = Path(checkpoint)
+def _run_folders(checkpoints: Sequence[str | None]) -> list[Path]:
+    """Folders of the training runs that checkpoints are of."""
+    places: list[Path] = []
+    for folder in map(Path, filter(None, checkpoints)):
         near = [folder, *folder.resolve().parents[:2]]
-        found += [place for place in near if (place / "metrics.csv").is_file()][:1]
-    return list({place.resolve(): place for place in found}.values())
+        places += [place for place in near if (place / "metrics.csv").is_file()][:1]
+    return list({place.resolve(): place for place in places}.values())
 
 
 def _run_task(options: TaskOptions) -> None:
-    from jaxcal.progress import Progress
-
+    figures = "jaxcal.adaptive.evaluation:decider_figures"
     options.require_writable()
-    progress, figures = Progress(quiet=options.quiet), "jaxcal.adaptive.evaluation"
-    _show(options, _sessions(options, progress), f"{figures}:decider_figures", progress)
+    _show(options, functools.partial(_sessions, options), figures)
 
 
 def _sessions(

@@ -1,8 +1,7 @@
 """How close each way of choosing postures comes to the proven optimum."""
 
 from jaxcal.evaluation.dataset import Dataset, load_dataset, save_csv, save_npz
-from jaxcal.evaluation.methods import evaluate
-from jaxcal.evaluation.postures import PostureEvaluation
+from jaxcal.evaluation.methods import PostureEvaluation, evaluate
 from jaxcal.evaluation.report import Evaluation, Summary, text_table
 
 __all__ = [

@@ -2,9 +2,8 @@
 
 .npz: ``candidates`` (episodes, M, n); optional ``measured`` (episodes, M, m),
 ``available`` (episodes, M) and ``low``, ``high`` (n,), the ranges that [0, 1] stands
-for. .csv: one candidate a line under the header ``episode,candidate,u_x,u_y,u_z`` and
-optionally ``,y_x,y_y,y_z`` and ``,available``; any columns ``u_...`` are inputs and any
-``y_...`` outputs, in their order; lines may come in any order.
+for. .csv: one candidate a line, in any order, under ``episode,candidate,u_...`` and
+optionally ``y_...`` and ``available``.
 """
 
 from __future__ import annotations
@@ -104,12 +103,8 @@ class Dataset:
 
 
 def load_dataset(path: str | os.PathLike[str]) -> Dataset:
-    """Read a .npz or .csv dataset.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: naming the file and the key, row or line at fault.
-    """
+    """Read a .npz or .csv dataset; a ValueError names the file and the key, row or line
+    at fault."""
     file = pathlib.Path(path)
     data, ending = file.read_bytes(), file.suffix.lower()
     sha256 = hashlib.sha256(data).hexdigest()
@@ -175,15 +170,7 @@ def save_csv(
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> None:
     """Write a .csv atomically, every number with all its digits; ranges are not kept.
-
-    Args:
-        dataset: what to write.
-        path: of the file.
-        progress: told how many episodes of how many are written.
-
-    Raises:
-        OSError: the folder is missing, not writable or full.
-    """
+    ``progress`` is told how many episodes of how many are written."""
     n, m, mask = dataset.num_inputs, dataset.num_outputs, dataset.available
     header = [*_LABELS, *(f"u_{axis_letter(i, n)}" for i in range(n))]
     values = [dataset.candidates]

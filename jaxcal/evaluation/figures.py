@@ -1,22 +1,19 @@
-"""Figures of an evaluation, for print: axes, units, legends.
-
-Functions return a matplotlib ``Figure`` and touch no file and no global state.
-"""
+"""Figures of an evaluation and of a training, for print: axes, units, legends."""
 
 from __future__ import annotations
 
 import itertools
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
+from scipy.signal import lfilter
 
 from jaxcal.checks import Array
-from jaxcal.evaluation.postures import PostureEvaluation, PostureResult, log_mean
-from jaxcal.models.affine import Affine
+from jaxcal.evaluation.methods import PostureEvaluation, PostureResult, log_mean
 from jaxcal.reports.plots.style import (
     BLACK,
     COLOURS,
@@ -26,6 +23,7 @@ from jaxcal.reports.plots.style import (
     numbered,
     panels,
 )
+from jaxcal.tables import read_table
 
 if TYPE_CHECKING:
     from jaxcal.evaluation.report import MethodResult
@@ -41,8 +39,6 @@ _FIXED: dict[str, dict[str, Any]] = {  # the style of random and exact in every 
 def evaluation_figures(evaluation: PostureEvaluation) -> dict[str, Figure]:
     """Every figure the evaluation holds data for, by file name without suffix."""
     drawn = [det_per_episode, det_means, det_distributions, gap_to_optimum, best_so_far]
-    if evaluation.dataset.measured is not None:
-        drawn.append(parameter_variance)
     return {draw.__name__: draw(evaluation) for draw in drawn}
 
 
@@ -147,10 +143,8 @@ def gap_to_optimum(evaluation: PostureEvaluation) -> Figure:
 
 
 def best_so_far(evaluation: PostureEvaluation) -> Figure:
-    """Largest det S found up to each episode (paper, Figure 4).
-
-    Of several draws an episode the median curve, with a band from 5 to 95 % of them.
-    """
+    """Largest det S found up to each episode (paper, Figure 4); of several draws the
+    median curve, with a band from 5 to 95 % of them."""
     figure, axes = _figure(evaluation, "Best det S so far", 3.8)
     x = np.arange(1, evaluation.dataset.num_episodes + 1)
     for name, log_det, style in _with_random(evaluation):
@@ -168,51 +162,28 @@ def best_so_far(evaluation: PostureEvaluation) -> Figure:
     return figure
 
 
-def parameter_variance(evaluation: PostureEvaluation) -> Figure:
-    """Variance over the episodes of each identified parameter (paper, Figure 5)."""
-    dataset = evaluation.dataset
-    rows = []
-    for result, style in zip(
-        evaluation.results, styles_of(evaluation.results), strict=True
-    ):
-        random = result.method == "random"
-        label = "random, median over draws" if random else _label(evaluation, result)
-        rows.append((label, evaluation.parameter_variance(result), None, style))
-    unit = "unit of measured and commands, squared"
-    if dataset.ranges is not None:
-        unit = "A: no unit, b: deg²"
-    names = Affine(dataset.num_inputs, dataset.num_outputs).names
-    figure = variances(rows, names, unit)
-    title = "Cross-episode variance of the identified parameters"
-    figure.axes[0].set_title(_title(evaluation, title), fontsize=10)
-    return figure
-
-
 def variances(
-    rows: Sequence[tuple[str, Array, tuple[Array, Array] | None, dict[str, Any]]],
+    rows: Sequence[tuple[str, Array, tuple[Array, Array], dict[str, Any]]],
     names: Sequence[str],
     unit: str,
 ) -> Figure:
     """Variance of each parameter; ``rows``: label, (P,) variances, lower and upper
-    ends of their intervals, style."""
+    ends of their 95 % intervals, colour and marker."""
     figure, axes = panels((8.0, 4.0))
     look = {"linestyle": "none", "markersize": 4.5, "elinewidth": 0.9}
-    offsets = np.linspace(-0.3, 0.3, len(rows)) if len(rows) > 1 else [0.0]
-    for (label, variance, ends, style), offset in zip(rows, offsets, strict=True):
-        error = None
-        if ends is not None:
-            # A percentile interval need not hold the estimate.
-            error = np.maximum([variance - ends[0], ends[1] - variance], 0.0)
-        marks = {"label": label, "color": style["color"], "marker": style["marker"]}
-        axes.errorbar(
-            np.arange(len(names)) + offset, variance, yerr=error, **marks, **look
-        )
+    offsets = np.linspace(-0.3, 0.3, len(rows))
+    for (label, variance, (low, high), style), offset in zip(
+        rows, offsets, strict=True
+    ):
+        x = np.arange(len(names)) + offset
+        # A percentile interval need not hold the estimate.
+        error = np.maximum([variance - low, high - variance], 0.0)
+        axes.errorbar(x, variance, yerr=error, label=label, **style, **look)
     for edge in np.arange(len(names) - 1) + 0.5:
         axes.axvline(edge, color="#DDDDDD", linewidth=0.6, zorder=0)
     axes.set_yscale("log")
     axes.set_xticks(range(len(names)), names)
-    bars = any(ends is not None for _, _, ends, _ in rows)
-    axes.set_xlabel("parameter" + (" (bars: 95 % intervals)" if bars else ""))
+    axes.set_xlabel("parameter (bars: 95 % intervals)")
     axes.set_ylabel(f"variance over episodes ({unit})")
     legend_right(axes)
     return figure
@@ -223,21 +194,15 @@ def _figure(
 ) -> tuple[Figure, Any]:
     """A titled figure of one panel, and its axes; height in inches."""
     figure, axes = panels((8.0, height))
-    axes.set_title(_title(evaluation, title), fontsize=10)
+    dataset, k = evaluation.dataset, evaluation.k
+    whole = f"{title}: {dataset.name}, {k} of {dataset.num_candidates}"
+    axes.set_title(whole, fontsize=10)
     return figure, axes
 
 
-def _title(evaluation: PostureEvaluation, what: str) -> str:
-    dataset = evaluation.dataset
-    return f"{what}: {dataset.name}, {evaluation.k} of {dataset.num_candidates}"
-
-
 def _det_axis(axis: Any, evaluation: PostureEvaluation, text: str = "{}") -> None:
-    """Name an axis that holds log10 det S and label it with powers of ten.
-
-    The logs are drawn rather than a log axis, because det S of many axes in encoder
-    pulses can exceed the largest float.
-    """
+    """Name an axis that holds log10 det S, which can exceed the largest float, and
+    label it with powers of ten."""
     unit = "as in the file" if evaluation.dataset.ranges is None else "in [0, 1]"
     axis.set_label_text(text.format(f"det S (commands {unit})"))
     axis.set_major_locator(MaxNLocator(nbins=8, integer=True))
@@ -283,3 +248,77 @@ def _with_random(
     if all(result.method != "random" for result in results):
         rows.append(("random", evaluation.random_log_det, _FIXED["random"]))
     return rows
+
+
+# -- of a training ---------------------------------------------------------------------
+
+
+def training_curves(runs: Mapping[str, pathlib.Path]) -> Figure:
+    """The paper's Figure 2 of training runs by name: (a) reward with its moving
+    average; (b) distribution of the reward over the last 1,000 episodes, else of the
+    means of the last updates; (c) smoothed curve, with the share of the optimum
+    reached."""
+    figure, (curve, spread, smooth) = panels((12.0, 3.8), shape=(1, 3))
+    twin, label, what = None, {"label": "moving average"}, ""
+    for number, (name, folder) in enumerate(runs.items()):
+        metrics, colour = read_metrics(folder / "metrics.csv"), COLOURS[number % 6]
+        x, reward = metrics["episodes"] / 1000.0, metrics["reward_mean"]
+        curve.plot(x, reward, color=colour, linewidth=0.8, alpha=0.5)
+        if "reward_std" in metrics and len(runs) == 1:
+            ends = reward - metrics["reward_std"], reward + metrics["reward_std"]
+            look: dict[str, Any] = {"color": COLOURS[5], "alpha": 0.2, "linewidth": 0}
+            curve.fill_between(x, *ends, label="± 1 s.d. of episodes", **look)
+        # The mean of the last ``window`` values, of fewer at the beginning.
+        window = max(1, min(len(reward) // 10, 50))
+        count = np.minimum(np.arange(1, len(reward) + 1), window)
+        mean = np.convolve(reward, np.ones(window))[: len(reward)] / count
+        curve.plot(x, mean, color=colour, **label)
+        label = {}
+        last, what = last_rewards(folder, metrics)
+        text = f"{name}: {np.mean(last):.3g} ± {np.std(last):.2g}"
+        bars = {"histtype": "step", "density": True, "color": colour, "label": text}
+        spread.hist(last, bins=min(50, max(5, len(last) // 10)), **bars)
+        # An exponential moving average, unbiased at the beginning.
+        columns = np.stack([reward, np.ones(len(x))])
+        sums, weights = lfilter([0.05], [1.0, -0.95], columns)
+        smooth.plot(x, sums / weights, color=colour, label=name)
+        finite = np.isfinite(ratio := metrics.get("ratio_to_exact", np.nan * x))
+        if finite.any():
+            twin = smooth.twinx() if twin is None else twin
+            twin.plot(x[finite], ratio[finite], color=colour, linestyle="--")
+            twin.set(ylabel="dashed: mean det S / det S*", ylim=(0.0, 1.02))
+    unit = "reward (log det S, scaled)"
+    for axes, title in ((curve, "(a) reward"), (smooth, "(c) smoothed curve")):
+        axes.set_title(title, fontsize=10)
+        axes.set(xlabel="training episodes (thousands)", ylabel=unit)
+    spread.set_title(f"(b) {what}", fontsize=10)
+    spread.set(xlabel=unit, ylabel="density")
+    curve.legend(fontsize=8, frameon=False)
+    spread.margins(y=0.1 + 0.08 * len(runs))  # room for the legend
+    spread.legend(fontsize=7, framealpha=1.0, edgecolor="none")  # over the lines
+    place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.2)}
+    smooth.legend(fontsize=8, frameon=False, ncols=3, **place)
+    return figure
+
+
+def read_metrics(path: pathlib.Path) -> dict[str, Array]:
+    """Columns of a ``metrics.csv``; NaN where a cell is empty."""
+    table = read_table(str(path))
+    for name in ("episodes", "reward_mean", *table.labels):
+        if name not in table.names:
+            table.columns([name])  # says that it is missing, or no number
+    return dict(zip(table.names, table.values.T, strict=True))
+
+
+def last_rewards(folder: pathlib.Path, metrics: dict[str, Array]) -> tuple[Array, str]:
+    path = folder / "last_rewards.npy"
+    if path.exists():
+        try:
+            rewards = np.load(path, allow_pickle=False).astype(np.float64).ravel()
+        except (ValueError, EOFError, TypeError):
+            raise ValueError(f"{path}: not an array of numbers") from None
+        rewards = rewards[np.isfinite(rewards)]
+        if rewards.size:
+            return rewards[-1000:], f"reward, last {min(len(rewards), 1000):,} episodes"
+    means = metrics["reward_mean"][-100:]
+    return means[np.isfinite(means)], f"mean reward, last {len(means)} updates"

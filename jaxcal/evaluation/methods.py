@@ -2,41 +2,31 @@
 
 Every method is judged by what it returned: log det S is computed here, from the
 indices. Random is drawn many times an episode; each draw counts as one selection.
-
-``evaluate_stream`` evaluates any number of episodes. The rows of a part are a file of
-its own. So a stopped run resumes, more episodes start from what is there, and processes
-that see the folder share the work; none of that changes a digit, because the same parts
-are averaged in the same order.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import json
-import math
-import pathlib
-import random
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from jaxcal import selection
-from jaxcal.checks import Array
-from jaxcal.deadline import NEVER, Deadline
+from jaxcal.checks import Array, one_of, whole_number
+from jaxcal.deadline import Deadline
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.postures import (
-    PostureEvaluation,
-    PostureResult,
-    estimate_parameters,
-    summary_of,
+from jaxcal.evaluation.report import (
+    Column,
+    Evaluation,
+    MethodResult,
+    Summary,
+    finite,
+    moments,
 )
-from jaxcal.evaluation.report import MethodNumbers, Summary, finite
-from jaxcal.extras import versions
-from jaxcal.files import write_text
 from jaxcal.information.regression import log_det_gram
 from jaxcal.models.affine import Affine
 from jaxcal.selection.problem import make_problems
@@ -55,37 +45,22 @@ METHODS = {  # each with its label in the table
     "greedy": "greedy",
     "exchange": "exchange",
     "exact": "exact",
-    "auto": "auto",
 }
 POLICIES = tuple(name for name in METHODS if name.startswith("policy"))
 BASELINES = ("random", "greedy", "exchange", "exact")
 DEFAULT_METHODS = (*POLICIES, *BASELINES)
 DEFAULT_RANDOM_DRAWS = 100
 
+HIT_TOLERANCE = 1e-9  # of log det(Z.T Z): the same determinant to a billionth
 _CHUNK = 250  # episodes between two reports of progress
 _CHUNK_EXACT = 50  # exact is slow for k above n + 1
-PART = 5_000  # episodes whose rows are one file; the draws' blocks of 1,000 divide it
-_MEANS = ("ratio_to_exact", "hit_rate", "d_efficiency", "seconds_per_selection")
 
 
 def check_methods(methods: Sequence[str]) -> tuple[str, ...]:
-    """The methods by their one name each, without repeats.
-
-    ``policy:greedy`` is ``policy``; ``policy:all`` is the policy under every decoding.
-
-    Raises:
-        ValueError: naming the one that is unknown, or that there is none.
-    """
-    several = {"policy:all": POLICIES, "policy:greedy": ("policy",)}
-    chosen: list[str] = []
-    for name in methods:
-        if name not in METHODS and name not in several:
-            names = ", ".join((*METHODS, "policy:all"))
-            raise ValueError(f"method must be one of {names}, got {name!r}")
-        chosen += several.get(name, (name,))
-    if not chosen:
+    """The methods without repeats; one that is unknown, or none, is refused."""
+    if not methods:
         raise ValueError("methods must name at least one method, got none")
-    return tuple(dict.fromkeys(chosen))
+    return tuple(dict.fromkeys(one_of("method", name, [*METHODS]) for name in methods))
 
 
 def evaluate(
@@ -115,9 +90,8 @@ def evaluate(
         progress: called as selections are made.
     """
     methods = check_methods(methods)
-    for name, value in (("num", num), ("random_draws", random_draws)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    whole_number("num", num, 1)
+    whole_number("random_draws", random_draws, 1)
     try:
         make_problems(dataset.candidates, k, available=dataset.available)
     except ValueError as error:
@@ -174,11 +148,6 @@ class _Run:
             parameters=estimate_parameters(self.dataset, indices),
         )
 
-    def pieces(self, size: int = _CHUNK) -> list[slice]:
-        """All episodes in slices of at most ``size``."""
-        total = self.dataset.num_episodes
-        return [slice(i, min(i + size, total)) for i in range(0, total, size)]
-
     def part(self, cut: slice) -> dict[str, Any]:
         """What every solver is given of some episodes."""
         mask = self.dataset.available
@@ -193,7 +162,8 @@ class _Run:
         total = self.dataset.num_episodes
         self.progress(label, 0, total)
         choices, seconds = [], 0.0
-        for cut in self.pieces(size):
+        for begin in range(0, total, size):
+            cut = slice(begin, min(begin + size, total))
             start = time.perf_counter()
             choices.append(choose(cut))
             seconds += time.perf_counter() - start
@@ -215,7 +185,7 @@ class _Run:
                 checkpoint=checkpoint,
             )
 
-        choose(self.pieces()[0])  # not timed: it may compile
+        choose(slice(0, _CHUNK))  # not timed: it may compile
         choices, seconds = self.timed(label, choose)
         indices = np.concatenate(choices)
         self.require_valid(label, indices)
@@ -237,26 +207,14 @@ class _Run:
             )
 
     def solver(self, method: str) -> PostureResult:
-        """A method without proof and without weights."""
+        """Greedy or exchange."""
 
         def choose(cut: slice) -> Indices:
-            part = self.part(cut)
             if method == "greedy":
-                return selection.greedy_batch(**part).indices
-            if method == "exchange":
-                return selection.exchange_batch(**part, seed=self.seed).indices
-            model = Affine(self.dataset.num_inputs, self.dataset.num_outputs)
-            sets, masks = part["candidates"], part["available"]
-            masks = [None] * len(sets) if masks is None else masks
-            auto = functools.partial(
-                selection.select, k=self.k, model=model, seed=self.seed
-            )
-            selections = [
-                auto(u, available=m) for u, m in zip(sets, masks, strict=True)
-            ]
-            return np.array([selected.indices for selected in selections])
+                return selection.greedy_batch(**self.part(cut)).indices
+            return selection.exchange_batch(**self.part(cut), seed=self.seed).indices
 
-        choose(slice(0, 1))  # not timed: it may compile
+        choose(slice(0, 1))  # not timed: it may load a kernel
         choices, seconds = self.timed(method, choose)
         return self.result(method, np.concatenate(choices)[:, None], seconds)
 
@@ -264,21 +222,21 @@ class _Run:
         self, time_limit: float | None
     ) -> tuple[PostureResult, Array, NDArray[np.bool_]]:
         """The optimum, its (E,) log det S or an upper bound, and (E,) where proven."""
+        m = self.dataset.num_outputs
 
-        def choose(cut: slice) -> tuple[NDArray[Any], ...]:
-            """(E, k) indices, (E,) proven, (E,) upper bounds."""
-            limit_s = None if deadline is NEVER else max(deadline.remaining_s, 1e-3)
-            m = self.dataset.num_outputs
-            batch = selection.exact_batch(
-                **self.part(cut), num_outputs=m, time_limit=limit_s
-            )
-            return batch.indices, batch.proven, batch.bound
+        def choose(cut: slice) -> Any:
+            limit_s = None if time_limit is None else max(deadline.remaining_s, 1e-3)
+            part = self.part(cut)
+            return selection.exact_batch(**part, num_outputs=m, time_limit=limit_s)
 
-        deadline = NEVER if time_limit is None else Deadline(time_limit)
-        choose(slice(0, 1))  # not timed: it may compile
-        deadline = NEVER if time_limit is None else Deadline(time_limit)
+        deadline = Deadline(time_limit or 0.0)
+        choose(slice(0, 1))  # not timed: it may load a kernel
+        deadline = Deadline(time_limit or 0.0)
         batches, seconds = self.timed("exact", choose, _CHUNK_EXACT)
-        indices, proven, bound = map(np.concatenate, zip(*batches, strict=True))
+        indices, proven, bound = (
+            np.concatenate([getattr(batch, name) for batch in batches])
+            for name in ("indices", "proven", "bound")
+        )
         result = self.result("exact", indices[:, None], seconds)
         reached = result.log_det[:, 0]
         return result, np.where(proven, reached, np.maximum(bound, reached)), proven
@@ -301,10 +259,8 @@ def draw_random(
     k: int,
     num: int,
 ) -> tuple[Indices, Array]:
-    """(E, R, k) selections, R = ``num`` an episode, and their (E, R) log det(Z.T Z).
-
-    Uniform among the invertible ones; the solver draws the singular ones again.
-    """
+    """(E, R, k) selections, R = ``num`` an episode, uniform among the invertible ones,
+    and their (E, R) log det(Z.T Z)."""
     shape = (len(candidates), num, candidates.shape[1])
     order = rng.random(shape)
     if available is not None:
@@ -328,112 +284,165 @@ def log_det_gram_of(candidates: Array, indices: Indices) -> Array:
     )
 
 
-def evaluate_stream(
-    draw: Callable[[int, int], Dataset],
-    episodes: int,
-    folder: pathlib.Path,
-    plan: Mapping[str, Any],
-    progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> Summary:
-    """Evaluate the first episodes of a dataset, resuming from the parts in a folder.
-
-    Args:
-        draw: (begin, end) -> episodes; ``begin`` is a multiple of 1,000.
-        episodes: how many.
-        folder: made where it is missing.
-        plan: JSON values: ``dataset``, and the arguments of ``evaluate``, ``methods``
-            and ``seed`` among them. Parts of another plan are refused.
-        progress: called as parts are completed.
-    """
-    options = {name: value for name, value in plan.items() if name != "dataset"}
-    options["methods"] = list(dict.fromkeys([*options["methods"], "random"]))
-
-    def solve(begin: int, end: int) -> Summary:
-        seed = options["seed"] + begin
-        return evaluate(draw(begin, end), **options | {"seed": seed}).summarise()
-
-    facts = solve(0, 1).facts  # what is wrong is said before anything is kept
-    _open(folder, plan)
-    cuts = [(begin, min(begin + PART, episodes)) for begin in range(0, episodes, PART)]
-    files = {folder / f"part-{a:012d}-{b:012d}.json": (a, b) for a, b in cuts}
-    todo = [path for path in files if not path.exists()]
-    random.shuffle(todo)
-    for number, path in enumerate(todo):
-        progress("parts", number, len(todo))
-        if not path.exists():  # no other process was sooner
-            begin, end = files[path]
-            part = solve(begin, end)
-            kept = [(row.method, row.checkpoint, row.numbers) for row in part.rows]
-            proven = round(part.facts["proven"] * (end - begin))
-            write_text(path, json.dumps({"proven": proven, "rows": kept}))
-    progress("parts", len(todo), len(todo))
-
-    parts = [_read(path) for path in files]
-    counts = [end - begin for begin, end in cuts]
-    rows = []
-    for i, (method, checkpoint, _) in enumerate(parts[0]["rows"]):
-        numbers = total(counts, [part["rows"][i][2] for part in parts])
-        rows.append(MethodNumbers(method, checkpoint, numbers))
-    middle = {row.method: row.numbers["det_s"]["mean"] for row in rows}["random"]
-    for row in rows:
-        mean = row.numbers["det_s"]["mean"]
-        row.numbers["ratio_to_random"] = mean / middle if mean and middle else None
-    facts = {
-        "dataset": facts["dataset"] | {"episodes": episodes},
-        "k": options["k"],
-        "seed": options["seed"],
-        "criterion": "D",
-    }
-    asked = tuple(row for row in rows if row.method in plan["methods"])
-    return summary_of(facts, asked, sum(part["proven"] for part in parts))
+# -- what is shown ---------------------------------------------------------------------
 
 
-def total(counts: list[int], parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """One row of all parts, of ``counts`` episodes each; a number that one of their
-    rows lacks is lacking."""
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class PostureResult(MethodResult):
+    """What one method chose in every episode of a dataset."""
 
-    def mean(values: Any) -> float:
-        return float(np.average(np.array(values, float), weights=counts))  # None: NaN
+    indices: Indices  # (E, R, k)
+    parameters: Array | None  # (E, R, m (n + 1)) identified from the chosen postures
 
-    # Medians and variances of parts do not add up.
-    row = {k: v for k, v in parts[0].items() if k != "parameter_variance"}
-    for name in _MEANS:
-        row[name] = finite(mean([part[name] for part in parts]))
-    for name in ("det_s", "log_det_s"):
-        held = [[part[name]["mean"], part[name]["std"]] for part in parts]
-        middles, stds = np.array(held, float).T
-        middle = mean(middles)
-        std = math.sqrt(mean(stds**2 + (middles - middle) ** 2))
-        row[name] = {"mean": finite(middle), "std": finite(std), "median": None}
-    return row
+    @property
+    def log_det(self) -> Array:  # (E, R)
+        return self.values
 
 
-def _open(folder: pathlib.Path, plan: Mapping[str, Any]) -> None:
-    """Make sure that the parts in a folder add up with those of this plan."""
-    weights = {}
-    if set(plan["methods"]) & set(POLICIES):
-        from jaxcal.learning.training.checkpoint import load
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class PostureEvaluation(Evaluation):
+    """All methods on one dataset, selection by selection; ``reference`` (E,) is log det
+    S* where proven, else an upper bound on it."""
 
-        for checkpoint in plan["checkpoints"]:
-            weights[checkpoint or "default"] = load(checkpoint).weights.fingerprint
-    head = {"format": "jaxcal-evaluation-stream", "version": 4, "part": PART}
-    whole = {**head, **plan, "weights": weights, "versions": versions()}
-    settings, path = json.loads(json.dumps(whole)), folder / "stream.json"
-    folder.mkdir(parents=True, exist_ok=True)
-    if not path.exists():
-        write_text(path, json.dumps(settings, indent=1) + "\n")
-    held = _read(path)
-    for name in (name for name in settings if held.get(name) != settings[name]):
-        raise ValueError(
-            f"{folder} holds parts of another evaluation: its {name} is "
-            f"{held.get(name)!r}, not {settings[name]!r}; name another folder"
+    title: ClassVar[str] = "Posture selection compared with the proven optimum"
+    about: ClassVar[str] = (
+        "det S is in the unit of the dataset's commands. S is the information matrix "
+        "AᵀA of the chosen postures, S* that of the best choice. Hit rate: share of "
+        "selections whose determinant equals the optimum's within 1e-9. D-eff.: mean "
+        "of (det S / det S*)^(1/p), p parameters. x random: mean det S divided by that "
+        "of random selection. Time: per selection, averaged over the batch."
+    )
+
+    dataset: Dataset
+    k: int  # postures chosen
+    results: tuple[PostureResult, ...]
+    proven: NDArray[np.bool_]  # (E,)
+    random_log_det: Array  # (E, R) the baseline behind ratio_to_random
+
+    def summarise(self, *, indices: bool = False) -> Summary:
+        """The numbers of every method; with ``indices`` also what each chose in every
+        episode (random: its first draw)."""
+        rows, data = self.rows(), self.dataset
+        if indices:
+            for row, result in zip(rows, self.results, strict=True):
+                row.numbers["indices"] = result.indices[:, 0].tolist()
+        k, m, n = self.k, data.num_outputs, data.num_inputs
+        seed = "" if data.seed is None else f", seed {data.seed}"
+        heading = (
+            f"{data.name}{seed}: {data.num_episodes:,} episodes, {k} of "
+            f"{data.num_candidates} postures, {n} inputs, {m} outputs"
         )
+        notes = []
+        if unproven := int((~self.proven).sum()):
+            notes.append(
+                f"{unproven} of {data.num_episodes} optima are not proven. There an "
+                "upper bound replaces det S*: true ratios and efficiencies are at "
+                "least those shown, and no selection counts as a hit"
+            )
+        if k == n + 1:
+            notes.append(
+                f"k = {k} fits {k * m} parameters with as many equations: no residual, "
+                "so the noise cannot be estimated; use a larger k"
+            )
+        facts: dict[str, Any] = {"dataset": data.facts(), "k": k, "seed": self.seed}
+        facts |= {"criterion": "D"}
+        if data.measured is not None:
+            facts["parameter_names"] = list(Affine(n, m).names)
+        facts |= {"proven": float(self.proven.mean()), "notes": notes}
+        return Summary(data.name, heading, _COLUMNS, rows, facts, tuple(notes))
+
+    def summary(self, result: PostureResult) -> dict[str, Any]:
+        """The numbers of one method, as documented in docs/evaluation.md."""
+        m = self.dataset.num_outputs
+        behind = self.less(result)
+        hits = self.proven[:, None] & (behind >= -HIT_TOLERANCE * m)
+        behind = np.minimum(behind, 0.0)
+        efficiency = np.exp(behind / (m * (self.dataset.num_inputs + 1)))
+        with np.errstate(over="ignore"):
+            det = np.exp(result.log_det)
+            times = np.exp(log_mean(result.log_det) - log_mean(self.random_log_det))
+        row: dict[str, Any] = {
+            "label": result.label,
+            "det_s": moments(det),
+            "log_det_s": moments(result.log_det),
+            "ratio_to_exact": float(np.exp(behind).mean()),
+            "hit_rate": float(hits.mean()),
+            "d_efficiency": float(efficiency.mean()),
+            "ratio_to_random": finite(times),
+            "seconds_per_selection": result.seconds,
+            "draws_per_episode": result.log_det.shape[1],
+        }
+        if result.parameters is not None:
+            # Of several draws an episode the median: that of random has a heavy tail.
+            variance = np.median(result.parameters.var(axis=0), axis=0)
+            row["parameter_variance"] = variance.tolist()
+        return row
 
 
-def _read(path: pathlib.Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
-        raise ValueError(
-            f"{path} is damaged ({error}). Delete it; it will be computed again"
-        ) from None
+def log_mean(log_values: Array) -> float:
+    """Log of the mean of exp, without overflow."""
+    return float(logsumexp(log_values) - np.log(log_values.size))
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _share(value: float) -> str:
+    """Four decimals, and never 1.0000 for what is below it."""
+    text = f"{value:.4f}"
+    return "0.9999+" if text == "1.0000" and value < 1.0 - 1e-12 else text
+
+
+def _time(seconds: float) -> str:
+    units = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}
+    unit = next((unit for unit, size in units.items() if seconds >= size), "µs")
+    return f"{seconds / units[unit]:.3g} {unit}"
+
+
+_COLUMNS: tuple[Column, ...] = (
+    ("method", lambda row: row.numbers["label"]),
+    ("mean det S", lambda row: _or_dash(row.numbers["det_s"]["mean"], ".4g")),
+    ("median det S", lambda row: _or_dash(row.numbers["det_s"]["median"], ".4g")),
+    ("det S/det S*", lambda row: _share(row.numbers["ratio_to_exact"])),
+    ("hit rate", lambda row: _share(row.numbers["hit_rate"])),
+    ("D-eff.", lambda row: _share(row.numbers["d_efficiency"])),
+    ("x random", lambda row: _or_dash(row.numbers["ratio_to_random"], ",.0f")),
+    ("time each", lambda row: _time(row.numbers["seconds_per_selection"])),
+)
+
+
+def estimate_parameters(dataset: Dataset, indices: Indices) -> Array | None:
+    """(E, R, m (n + 1)) least-squares parameters of selections (E, R, k), A row by row,
+    then b, in the unit of ``dataset.ranges`` where it has one, else of the candidates;
+    None where nothing was measured."""
+    if dataset.measured is None:
+        return None
+    commands = dataset.candidates
+    if dataset.ranges is not None:
+        commands = dataset.ranges.denormalise(commands)
+    gather = indices[..., None]
+    u = np.take_along_axis(commands[:, None], gather, axis=2)
+    y = np.take_along_axis(dataset.measured[:, None], gather, axis=2)
+    return least_squares(u, y)
+
+
+def least_squares(commands: Array, measured: Array) -> Array:
+    """(..., m (n + 1)) A row by row, then b, of many sets of postures at once:
+    ``commands`` (..., N, n), N > n and of full rank, ``measured`` (..., N, m)."""
+    mean_u = commands.mean(axis=-2, keepdims=True)
+    mean_y = measured.mean(axis=-2, keepdims=True)
+    q, r = np.linalg.qr(commands - mean_u)
+    slopes = np.linalg.solve(r, np.matrix_transpose(q) @ (measured - mean_y))
+    biases = (mean_y - mean_u @ slopes)[..., 0, :]
+    matrix = np.matrix_transpose(slopes)
+    return np.concatenate([matrix.reshape(*biases.shape[:-1], -1), biases], axis=-1)
+
+
+def predict(parameters: Array, commands: Array) -> Array:
+    """(..., N, m) outputs at (..., N, n) commands, of the ``parameters`` (..., m (n +
+    1)) of ``least_squares``."""
+    n = commands.shape[-1]
+    m = parameters.shape[-1] // (n + 1)
+    matrix = parameters[..., : m * n].reshape(*parameters.shape[:-1], m, n)
+    return commands @ np.matrix_transpose(matrix) + parameters[..., None, m * n :]

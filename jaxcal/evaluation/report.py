@@ -6,8 +6,9 @@ import abc
 import dataclasses
 import json
 import pathlib
+import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -17,20 +18,25 @@ from jaxcal.files import atomic_write
 from jaxcal.reports.page import Block, Code, Figure, Page, Section, Table, Text, render
 
 
-@dataclasses.dataclass(frozen=True)
-class _Named:
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class MethodResult:
+    """What one method reached in each of E cases; R draws, 1 unless random."""
+
     method: str  # as asked for: "greedy", "policy:first", ...
     checkpoint: Any  # of a policy, for the JSON; None: the shipped one, a baseline
+    label: str  # in words
+    values: Array  # (E, R) larger is better
+    seconds: float  # a decision, averaged over a batch, compilation left out
 
     @property
     def is_policy(self) -> bool:
         return self.method.startswith("policy")
 
 
-@dataclasses.dataclass(frozen=True)
-class MethodNumbers(_Named):
-    """One method in the numbers that the table, the JSON and the page show."""
+class MethodNumbers(NamedTuple):
+    """One method, and the numbers that the table, the JSON and the page show."""
 
+    result: MethodResult
     numbers: dict[str, Any]  # as documented in docs/evaluation.md; "label": in words
 
 
@@ -51,15 +57,6 @@ class Summary:
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class MethodResult(_Named):
-    """What one method reached in each of E cases; R draws, 1 unless random."""
-
-    label: str  # in words
-    values: Array  # (E, R) larger is better
-    seconds: float  # a decision, averaged over a batch, compilation left out
-
-
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Evaluation(abc.ABC):
     """Methods on the same cases; a subclass makes and scores them."""
 
@@ -76,9 +73,7 @@ class Evaluation(abc.ABC):
 
     def rows(self) -> tuple[MethodNumbers, ...]:
         """The numbers of every method."""
-        return tuple(
-            MethodNumbers(r.method, r.checkpoint, self.summary(r)) for r in self.results
-        )
+        return tuple(MethodNumbers(r, self.summary(r)) for r in self.results)
 
     @abc.abstractmethod
     def summary(self, result: Any) -> dict[str, Any]:
@@ -126,20 +121,13 @@ def write_report(
     folder: pathlib.Path,
     evaluations: Sequence[Evaluation],
     draw: Callable[[Any], Mapping[str, Any]],
-    runs: Sequence[pathlib.Path] = (),
+    training: Mapping[str, Any],
     *,
     command: Sequence[str],
 ) -> int:
     """Draw everything, then write each figure as SVG and PNG, and ``index.html`` last;
-    returns how many figures there are.
-
-    Args:
-        folder: made where it is missing.
-        evaluations: a section each.
-        draw: figures of an evaluation by name, of ``jaxcal.evaluation.figures``.
-        runs: folders of training runs to draw curves of.
-        command: what was typed, for the record.
-    """
+    returns how many figures there are. ``draw`` makes those of an evaluation, by name,
+    ``training`` are others, ``command`` is what was typed, for the record."""
     files: dict[str, bytes] = {}
     summaries = [evaluation.summarise() for evaluation in evaluations]
     prefixes = file_prefixes([shown.name for shown in summaries])
@@ -150,11 +138,8 @@ def write_report(
         blocks += [Text(note, "note") for note in shown.notes]
         blocks += _drawn(draw(evaluation), files, prefix and f"{prefix}_")
         sections.append(Section(shown.heading, blocks))
-    if runs:
-        from jaxcal.evaluation.training_figure import training_curves
-
-        curves = {"training_curves": training_curves({run.name: run for run in runs})}
-        sections.append(Section("Training", _drawn(curves, files)))
+    if training:
+        sections.append(Section("Training", _drawn(training, files)))
     made_with = ", ".join(f"{name} {v}" for name, v in versions().items())
     page = Page(
         evaluations[0].title,
@@ -174,11 +159,8 @@ def write_report(
 def file_prefixes(names: Sequence[str]) -> list[str]:
     """What the figure files of each dataset are called first; no two alike."""
 
-    def plain(name: str) -> str:
-        stem = pathlib.PurePath(name).stem or name
-        return "".join(c if c.isalnum() or c in "-." else "-" for c in stem)
-
-    prefixes = [plain(name) for name in names]
+    stems = [pathlib.PurePath(name).stem or name for name in names]
+    prefixes = [re.sub(r"[^\w.-]|_", "-", stem) for stem in stems]
     return [
         name if prefixes.count(name) == 1 else f"{name}-{number}"
         for number, name in enumerate(prefixes, start=1)
@@ -205,8 +187,8 @@ def _rows(shown: Summary) -> list[tuple[str, ...]]:
     table = [tuple(title for title, _ in shown.columns)]
     for row in shown.rows:
         name, *cells = (cell(row) for _, cell in shown.columns)
-        if many and row.is_policy:
-            name += f" ({row.checkpoint or 'default'})"
+        if many and row.result.is_policy:
+            name += f" ({row.result.checkpoint or 'default'})"
         table.append((name, *cells))
     return table
 
@@ -214,9 +196,9 @@ def _rows(shown: Summary) -> list[tuple[str, ...]]:
 def _checkpoints(shown: Summary) -> list[Any]:
     """The checkpoints of the policies, without repeats."""
     checkpoints: list[Any] = []  # of tasks they are dictionaries, without a hash
-    for row in shown.rows:
-        if row.is_policy and row.checkpoint not in checkpoints:
-            checkpoints.append(row.checkpoint)
+    for result, _ in shown.rows:
+        if result.is_policy and result.checkpoint not in checkpoints:
+            checkpoints.append(result.checkpoint)
     return checkpoints
 
 
@@ -228,9 +210,9 @@ def _entries(shown: Summary) -> list[dict[str, Any]]:
             **shown.facts,
             "checkpoint": (checkpoint or "default") if checkpoints else None,
             "methods": {
-                row.method: row.numbers
-                for row in shown.rows
-                if not row.is_policy or row.checkpoint == checkpoint
+                result.method: numbers
+                for result, numbers in shown.rows
+                if not result.is_policy or result.checkpoint == checkpoint
             },
         }
         for checkpoint in checkpoints or [None]

@@ -1,20 +1,14 @@
 """Datasets 1 to 5 of the paper's Table 3 (docs/datasets.md), each by seed.
 
 Commands are uniform within ``RANGES`` and stored normalised to [0, 1], as in the paper.
-The outputs of dataset3 are ``y = diag(scale) u + bias`` (Table 1) of the commands in
-degrees, with white Gaussian noise of ``NOISE_STD_DEG`` on every output.
+Every block of 1,000 episodes has a random stream of its own, spawned from the seed, the
+dataset's number and the block's: no dataset shares candidates with another, and fewer
+episodes are the first of them.
 
-Every block of 1,000 episodes of every drawn dataset has a random stream of its own,
-spawned from the seed, the dataset's number and the block's: no dataset shares
-candidates with another, and fewer episodes are the first of them. Training draws from
-JAX's generator, a different one.
-
-Datasets 4 and 5 are what the rig recorded: the ``pairs.csv`` of ``jaxcal-rig collect``,
-one posture per line, commands under ``u_deg_pitch, u_deg_yaw, u_deg_roll`` and what the
-phone read under ``y_deg_...``. Beside ``dataset4.csv`` may stand a data card
-``dataset4.json`` whose ``ranges_deg`` say what [0, 1] stands for. The paper recorded
-550 postures and speaks of 100 x 50 and 1 x 50: so dataset4 is drawn from its pool, 50
-of 500 per episode; dataset5 is the first 50 postures of its own session.
+Datasets 4 and 5 are the ``pairs.csv`` of ``jaxcal-rig collect``, one posture per line:
+commands ``u_deg_pitch, u_deg_yaw, u_deg_roll``, readings of the phone ``y_deg_...``.
+The paper recorded 550 postures and speaks of 100 x 50 and 1 x 50: so dataset4 is drawn
+from its pool, 50 of 500 per episode; dataset5 is the first 50 of its own session.
 """
 
 from __future__ import annotations
@@ -49,7 +43,6 @@ EPISODES = {
     "dataset5": 1,
 }
 NAMES = tuple(EPISODES)
-DRAWN = ("dataset1", "dataset2", "dataset3")
 RECORDED = ("dataset4", "dataset5")
 NUM_CANDIDATES = 50
 BLOCK = 1_000  # episodes of a drawn dataset that share a random stream
@@ -63,11 +56,14 @@ def make_dataset(
     *,
     recordings: pathlib.Path | str | None = None,
 ) -> Dataset:
-    """One of the paper's datasets, whole; the arguments are those of ``chunks``.
-
-    The whole of dataset1 takes 240 MB; ``chunks`` gives it in pieces.
-    """
-    return _joined(list(chunks(name, seed, episodes, recordings=recordings)))
+    """One of the paper's datasets, whole (dataset1: 240 MB); arguments as
+    ``chunks``."""
+    parts = list(chunks(name, seed, episodes, recordings=recordings))
+    whole: dict[str, Any] = {}
+    for key in ("candidates", "measured"):
+        if (arrays := [getattr(part, key) for part in parts])[0] is not None:
+            whole[key] = np.concatenate(arrays)
+    return dataclasses.replace(parts[0], **whole)
 
 
 def chunks(
@@ -83,13 +79,11 @@ def chunks(
         name: dataset1 to dataset5.
         seed: of the streams, 0 or greater; of the draws from the pool (dataset4).
         episodes: the first so many; all when not given.
-        recordings: folder of dataset4.csv and dataset5.csv; the shipped one when not
-            given.
+        recordings: folder of dataset4.csv and dataset5.csv; None is the shipped one.
 
     Raises:
         OSError: a recording cannot be read.
-        ValueError: naming the argument, before the first chunk is drawn, or the line of
-            a recording.
+        ValueError: before the first chunk is drawn; or of a line of a recording.
     """
     if name == "dataset0":
         raise ValueError(
@@ -106,39 +100,19 @@ def chunks(
             f"episodes must be in [1, {EPISODES[name]}] for {name}, got {total}"
         )
     if name in RECORDED:
-        return iter([recorded_dataset(name, seed, folder=recordings).part(0, total)])
-    begins = range(0, total, BLOCK)
-    return (drawn(name, seed, begin, min(begin + BLOCK, total)) for begin in begins)
+        return iter([_recorded(name, seed, recordings).part(0, total)])
+    counts = [min(BLOCK, total - begin) for begin in range(0, total, BLOCK)]
+    return (_drawn(name, seed, block, count) for block, count in enumerate(counts))
 
 
-def _joined(parts: list[Dataset]) -> Dataset:
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("candidates", "measured")
-        if getattr(parts[0], name) is not None
-    }
-    return dataclasses.replace(parts[0], **arrays)
-
-
-def drawn(name: str, seed: int, begin: int, end: int) -> Dataset:
-    """Episodes ``begin``, a multiple of ``BLOCK``, to ``end`` of one of ``DRAWN``: of
-    any number, the paper's size is not a limit."""
-    if name not in DRAWN:
-        raise ValueError(
-            f"a streamed dataset must be one of {', '.join(DRAWN)} (drawn from a seed "
-            f"without end), got {name!r}"
-        )
-    parts = []
-    for first in range(begin, end, BLOCK):
-        draw, noise = streams(name, seed, first // BLOCK)
-        count = min(BLOCK, end - first)
-        candidates = draw.random((count, NUM_CANDIDATES, 3))
-        measured = None
-        if name == "dataset3":
-            measured = RANGES.denormalise(candidates) * SCALE + BIAS_DEG
-            measured += noise.normal(0.0, NOISE_STD_DEG, measured.shape)
-        parts.append(Dataset(name, candidates, measured, ranges=RANGES, seed=seed))
-    return _joined(parts)
+def _drawn(name: str, seed: int, block: int, count: int) -> Dataset:
+    draw, noise = streams(name, seed, block)
+    candidates = draw.random((count, NUM_CANDIDATES, 3))
+    measured = None
+    if name == "dataset3":
+        measured = RANGES.denormalise(candidates) * SCALE + BIAS_DEG
+        measured += noise.normal(0.0, NOISE_STD_DEG, measured.shape)
+    return Dataset(name, candidates, measured, ranges=RANGES, seed=seed)
 
 
 def streams(
@@ -150,14 +124,9 @@ def streams(
     return np.random.default_rng(draw), np.random.default_rng(noise)
 
 
-def recorded_dataset(
-    name: str, seed: int = 0, *, folder: str | os.PathLike[str] | None = None
-) -> Dataset:
-    """Episodes of the recording ``name``.csv in a folder, the shipped one when None.
-
-    With enough postures for every episode they are taken in the order they were
-    recorded; with fewer every episode is a draw without repeats, by the seed.
-    """
+def _recorded(name: str, seed: int, folder: pathlib.Path | str | None) -> Dataset:
+    """With enough postures for every episode they are taken in the order they were
+    recorded; with fewer every episode is a draw without repeats, by the seed."""
     path = (SHIPPED if folder is None else pathlib.Path(folder)) / f"{name}.csv"
     commands, measured, ranges, digest = read_pool(path)
     episodes, have = EPISODES[name], len(commands)
@@ -178,12 +147,9 @@ def recorded_dataset(
 
 
 def read_pool(path: str | os.PathLike[str]) -> tuple[Array, Array, JointRanges, str]:
-    """A recording in the order in which it was made.
-
-    Returns:
-        (N, 3) commands and (N, 3) readings in degrees, the ranges that [0, 1]
-        stands for, and the SHA-256 of the file.
-    """
+    """A recording in the order in which it was made: (N, 3) commands and (N, 3)
+    readings in degrees, the ranges that [0, 1] stands for, and the SHA-256 of the
+    file."""
     file = pathlib.Path(path)
     data = file.read_bytes()
     ranges = _ranges_beside(file)
@@ -208,15 +174,13 @@ def read_pool(path: str | os.PathLike[str]) -> tuple[Array, Array, JointRanges, 
 def _ranges_beside(recording: pathlib.Path) -> JointRanges:
     """The ranges its data card names; ours where there is none."""
     card = recording.with_suffix(".json")
+    if not card.exists():
+        return RANGES
     try:
-        document: Any = json.loads(card.read_text(encoding="utf-8"))
-        named = document.get("ranges_deg")
+        named = json.loads(card.read_text(encoding="utf-8")).get("ranges_deg")
         if named is None:
             return RANGES
-        low, high = zip(*(named[axis] for axis in AXES), strict=True)
-        return JointRanges(low, high)
-    except FileNotFoundError:
-        return RANGES
+        return JointRanges(*zip(*(named[axis] for axis in AXES), strict=True))
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(
             f'{card}: "ranges_deg" must give [low, high] of {", ".join(AXES)}: {error}'

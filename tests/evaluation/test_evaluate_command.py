@@ -10,7 +10,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ import pytest
 from jaxcal.commands import evaluate as command
 from jaxcal.commands import tables
 from jaxcal.evaluation import figures
-from jaxcal.evaluation import methods as stream
 from jaxcal.evaluation.dataset import Dataset, save_csv, save_npz
 from jaxcal.information.regression import regression_matrix
 from jaxcal.paper.datasets import make_dataset
@@ -137,12 +135,15 @@ def test_the_report_is_one_page_and_figures(
         figures, "evaluation_figures", lambda found: {"all": figures.det_means(found)}
     )
     folder = tmp_path / "run"
-    folder.mkdir()
+    (folder / "checkpoint" / "7").mkdir(parents=True)
     (folder / "metrics.csv").write_text("episodes,reward_mean\n16,-1\n32,-0.5\n")
+    steps = [None, str(folder), str(folder / "checkpoint" / "7")]
+    assert command._run_folders(steps) == [folder]
+    monkeypatch.setattr(command, "_run_folders", lambda _: [folder])
     done = call(
         capsys,
         *("--dataset", "dataset3", "--episodes", 5, "--methods", "random,exact"),
-        *("--report", tmp_path / "report", "--run", folder),
+        *("--report", tmp_path / "report"),
     )
     assert done.returncode == 0, done.stderr
     names = {path.name for path in (tmp_path / "report").iterdir()}
@@ -197,7 +198,6 @@ FLAT[1, :, 2] = 1.0
         (["--dataset", "{tmp}/bad.csv"], "bad.csv: line 2, column 'u_y' must hold"),
         (["--dataset", "{tmp}/flat.npz"], "flat.npz: in set 1: .* lie in one plane"),
         (["--checkpoint", "x", "--methods", "exact"], "no policy is among --methods"),
-        (["--run", "{tmp}"], "holds no metrics.csv"),
         (["--bogus"], "unrecognized arguments: --bogus"),
         (["--report", "{tmp}/torn.npz/x"], "torn.npz is not a folder"),
         (["--report", "/proc/none/x"], "/proc"),
@@ -272,69 +272,21 @@ def test_dataset0_says_how_it_is_made(capsys: pytest.CaptureFixture[str]) -> Non
     assert "python -m benchmarks.paper.datasets dataset0 --out DIR" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("number", "code", "says"),
-    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")],
-)
 def test_a_stopped_command_writes_nothing(
     tmp_path: pathlib.Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-    number: int,
-    code: int,
-    says: str,
 ) -> None:
     def stop(_: object, task: str, done: int, total: int) -> None:
         if done:
-            signal.raise_signal(number)
+            signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(Progress, "__call__", stop)
     out = tmp_path / "o.json"
     done = call(capsys, "--episodes", 3, "--methods", "greedy", "--json", out)
-    assert done.returncode == code and done.stdout == ""
-    assert done.stderr == f"evaluate.py: {says}, nothing was written\n"
+    assert done.returncode == 130 and done.stdout == ""
+    assert done.stderr == "evaluate.py: interrupted, nothing was written\n"
     assert list(tmp_path.iterdir()) == []
-    folder = tmp_path / "parts"
-    monkeypatch.setattr(stream, "PART", 1_000)
-    done = call(
-        capsys,
-        *("--stream", folder, "--episodes", 1_800, "--methods", "greedy"),
-        *("--draws", 2),
-    )
-    assert done.returncode == code
-    kept = "finished parts are kept; run the same command again to resume"
-    assert done.stderr == f"evaluate.py: {says}, {kept}\n"
-    parts = {f"part-{ends}.json" for ends in ("000000000000-000000001000",
-                                              "000000001000-000000001800")}  # fmt: skip
-    names = {path.name for path in folder.iterdir()} - {"stream.json"}
-    assert len(names) == 1 and names < parts  # either may come first
-
-
-@pytest.mark.slow  # the test before covers the path in this process
-def test_a_stream_stopped_by_sigterm_says_so_and_keeps_its_parts(
-    tmp_path: pathlib.Path,
-) -> None:
-    folder = tmp_path / "parts"
-    child = subprocess.Popen(
-        [
-            *(sys.executable, str(ROOT / "evaluate.py"), "--stream", str(folder)),
-            *("--episodes", "10000000", "--methods", "greedy", "--draws", "2"),
-        ],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert child.stderr is not None
-    while not list(folder.glob("part-*")):
-        assert child.poll() is None
-        time.sleep(0.1)
-    child.send_signal(signal.SIGTERM)
-    _, errors = child.communicate(timeout=120)
-    assert child.returncode == 143, errors
-    says = "terminated, finished parts are kept; run the same command again to resume"
-    assert errors.splitlines()[-1] == f"evaluate.py: {says}"
-    assert not [path for path in folder.iterdir() if path.suffix != ".json"]
 
 
 @pytest.mark.slow
@@ -342,7 +294,7 @@ def test_the_shipped_policy_has_a_row_for_each_decoding(
     tmp_path: pathlib.Path,
 ) -> None:
     out = tmp_path / "out.json"
-    done = run("--episodes", 200, "--methods", "policy:all,random", "--json", out)
+    done = run("--episodes", 200, "--json", out)
     assert done.returncode == 0, done.stderr
     rows = json.loads(out.read_text())["results"][0]["methods"]
     assert rows["policy"]["ratio_to_exact"] > 0.9

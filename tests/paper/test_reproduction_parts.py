@@ -23,7 +23,7 @@ from benchmarks.paper.exhibits.study import Settings, Study
 from benchmarks.paper.exhibits.training import exhibits, kept_runs, plateau
 from benchmarks.paper.exhibits.variance import variance_table
 from jaxcal.calibration.identify import identify
-from jaxcal.evaluation.postures import least_squares, predict
+from jaxcal.evaluation.methods import least_squares, predict
 from jaxcal.reports.plots import as_bytes
 from jaxcal.tables import csv_text
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.paper.training_runs import main, thinned
 from jaxcal.commands.train import main as train
-from jaxcal.evaluation.training_figure import read_metrics
+from jaxcal.evaluation.figures import read_metrics
 
 
 def test_thinning_keeps_moments_and_last_values(rng: np.random.Generator) -> None:

@@ -23,7 +23,7 @@ from benchmarks.paper.exhibits.intervals import (
     share_interval,
 )
 from benchmarks.paper.exhibits.study import Study, choose
-from jaxcal.evaluation.postures import least_squares, predict
+from jaxcal.evaluation.methods import least_squares, predict
 from jaxcal.paper.datasets import AXES, NOISE_STD_DEG, RANGES
 from jaxcal.reports.plots.style import (
     BLACK,

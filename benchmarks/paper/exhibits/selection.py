@@ -16,7 +16,7 @@ from benchmarks.paper.exhibits.intervals import (
 )
 from benchmarks.paper.exhibits.study import Settings, Study
 from jaxcal.evaluation import figures
-from jaxcal.evaluation.postures import HIT_TOLERANCE, PostureEvaluation
+from jaxcal.evaluation.methods import HIT_TOLERANCE, PostureEvaluation
 from jaxcal.reports.plots.style import BLACK, COLOURS, legend_right, panels
 
 Array = NDArray[np.float64]

@@ -10,8 +10,13 @@ from numpy.typing import NDArray
 
 from benchmarks.paper.datasets import make_dataset
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.methods import Progress, evaluate
-from jaxcal.evaluation.postures import PostureEvaluation, PostureResult, least_squares
+from jaxcal.evaluation.methods import (
+    PostureEvaluation,
+    PostureResult,
+    Progress,
+    evaluate,
+    least_squares,
+)
 
 Array = NDArray[np.float64]
 

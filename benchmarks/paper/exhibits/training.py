@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from benchmarks.paper.exhibits.exhibit import Exhibit, Verdict, judge
 from benchmarks.paper.exhibits.intervals import mean_interval
 from benchmarks.paper.exhibits.study import Study
-from jaxcal.evaluation.training_figure import (
+from jaxcal.evaluation.figures import (
     last_rewards,
     read_metrics,
     training_curves,
