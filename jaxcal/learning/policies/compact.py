@@ -46,11 +46,9 @@ class _Dense(nn.Module):
 
 
 class _Round(nn.Module):
-    """One round of messages among the active candidates, then a residual MLP.
-
-    The message to candidate i, ``sum_j (x_i . x_j)^2 v_j``, is computed through the
-    second moments of the whole set, so that the cost grows with M and not M squared.
-    """
+    """One round of messages among the active candidates, then a residual MLP. That to
+    i, ``sum_j (x_i . x_j)^2 v_j``, is computed through the second moments of the whole
+    set, so that the cost grows with M and not M squared."""
 
     width: int
 

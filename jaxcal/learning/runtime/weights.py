@@ -1,8 +1,7 @@
 """Paths of checkpoints, and a policy as one plain file; needs no JAX and no orbax.
 
 A weights file (``.npz``) holds the weights by flat name (``encoder_0.mix.kernel``) and
-``header``: JSON with format, version, network, the checkpoint's meta and the SHA-256 of
-network and weights, by which damage is found.
+``header``: JSON with format, version, network, meta and SHA-256 of network and weights.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """brax's own PPO on the environment of postures: ``python train.py --trainer brax``.
 
-The policy is the paper's architecture, because brax's trainer gives a network the
-observation and nothing else; it is masked by the availability in that observation.
+The policy is the paper's network: brax's trainer gives it the observation alone.
 """
 
 from __future__ import annotations
