@@ -22,9 +22,9 @@ EXIT_LOST = 3  # another process of the job is gone
 HEARTBEAT_SECONDS = 20  # silence after which a process counts as lost
 _CONNECT_SECONDS = 300  # for all processes to come together
 _LEAVE_SECONDS = 3600  # for process 0 to write its files when the others are done
-_LAUNCHERS = (  # what those that JAX knows set in each process that they start
-    *("SLURM_STEP_NODELIST", "OMPI_COMM_WORLD_SIZE", "JOB_COMPLETION_INDEX"),
+_LAUNCHERS = (  # what others that JAX knows set in each process that they start
     *("JAX_COORDINATOR_ADDRESS", "MEGASCALE_COORDINATOR_ADDRESS"),
+    "JOB_COMPLETION_INDEX",
 )
 
 
@@ -47,12 +47,14 @@ def expected(job: Job, environ: Mapping[str, str] = os.environ) -> bool:
     if number == 1:
         return False
     if address is number is process_id is None:
-        if "1" in map(environ.get, ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE")):
-            return False
+        # A batch script has SLURM_NTASKS too, but runs outside any job step.
+        several = environ.get("SLURM_NTASKS", "1") != "1"
+        several &= "SLURM_STEP_NODELIST" in environ
+        several |= environ.get("OMPI_COMM_WORLD_SIZE", "1") != "1"
+        several |= "," in environ.get("TPU_WORKER_HOSTNAMES", "")
         # The slice of a Cloud TPU machine is in its metadata, which only JAX reads.
-        tpu = any(map(os.path.exists, ("/dev/accel0", "/dev/vfio/0")))
-        tpu |= "," in environ.get("TPU_WORKER_HOSTNAMES", "")
-        return tpu or any(name in environ for name in _LAUNCHERS)
+        several |= any(map(os.path.exists, ("/dev/accel0", "/dev/vfio/0")))
+        return several or any(name in environ for name in _LAUNCHERS)
     if address is None or number is None or process_id is None:
         raise ValueError(
             "--coordinator, --num-processes and --process-id must come together"
