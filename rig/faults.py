@@ -1,7 +1,4 @@
-"""How a run can end: exit codes, what raises them, and what was asked from outside.
-
-Nothing heavy is imported here: ``stop`` asks the session before it loads anything.
-"""
+"""How a run can end: exit codes, what raises them, and what was asked from outside."""
 
 from __future__ import annotations
 
@@ -44,18 +41,6 @@ class NotFollowing(MotionFault):
 
 class TurnedTooFar(MotionFault):
     """A move turned the phone further than was proved of it."""
-
-
-class EndedShort(MotionFault):
-    """A drive reports its move done but stands short of the target.
-
-    It was stopped from outside, or reached a limit of its own.
-    """
-
-    def __init__(self, text: str, axis: str, pulses: int) -> None:
-        self.axis = axis
-        self.pulses = pulses  # where it stands
-        super().__init__(text)
 
 
 class Unreachable(RuntimeError):
@@ -105,11 +90,8 @@ def ending(error: BaseException, folder: pathlib.Path) -> tuple[int, str, str]:
 
 
 class Requests:
-    """What was asked of a session from outside: to pause, or to stop.
-
-    Setting a flag is all that a request does; it is looked at before every frame and in
-    every loop. ``rig.signals`` sets them from the signals of the operating system.
-    """
+    """What was asked of a session from outside, by flags alone: they are looked at
+    before every frame and in every loop."""
 
     def __init__(self) -> None:
         self.armed = False

@@ -1,7 +1,5 @@
-"""Registers of a drive: values, words, frames and bits, without the schema of a map.
-
-``config.maps`` checks a map's tables and has these for what they do. A stop makes them
-of what it can read of a map, whatever else is wrong with that.
+"""Registers of a drive: values, words, frames and bits, without the schema of a map
+that ``config.maps`` adds and a stop does without.
 """
 
 from __future__ import annotations
@@ -9,7 +7,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 Kind = Literal["u16", "i16", "u32", "i32", "u48", "i48", "u64", "i64", "f32", "f64"]
 FORMATS: tuple[Kind, ...] = get_args(Kind)
@@ -109,11 +107,10 @@ class Table:
 class Value(Table):
     """A value to read: registers by function 3 or 4, or bits by 1 or 2."""
 
-    if TYPE_CHECKING:
-        address: int
-        type: Kind
-        function: Literal[1, 2, 3, 4]
-        bits: int  # 0: as many as the registers have
+    address: int
+    type: Kind
+    function: Literal[1, 2, 3, 4]
+    bits: int  # 0: as many as the registers have
 
     @property
     def count(self) -> int:
@@ -122,29 +119,25 @@ class Value(Table):
     @property
     def quantity(self) -> int:
         """Registers, or bits, that are asked for."""
-        whole = self.count if self.function in REGISTERS else 16 * self.count
-        return self.bits or whole
+        return self.bits or self.count * (1 if self.function in REGISTERS else 16)
 
 
 class Place(Value):
     """A position, in counts once it is multiplied by ``counts``."""
 
-    if TYPE_CHECKING:
-        counts: float
+    counts: float
 
 
 class Bits(Table):
     """Bits of the status word: every ``set`` bit is 1 and every ``clear`` bit is 0."""
 
-    if TYPE_CHECKING:
-        set: tuple[int, ...]
-        clear: tuple[int, ...]
+    set: tuple[int, ...]
+    clear: tuple[int, ...]
 
     def holds(self, word: int) -> bool:
         """Whether a status word satisfies it."""
-        return all(word >> b & 1 for b in self.set) and not any(
-            word >> b & 1 for b in self.clear
-        )
+        pairs = [*((b, 1) for b in self.set), *((b, 0) for b in self.clear)]
+        return all(word >> b & 1 == value for b, value in pairs)
 
 
 class Flags(Value):
@@ -159,10 +152,9 @@ class Flags(Value):
 class Frame(Table):
     """One frame to write: constants, and values by name such as ``position:i32``."""
 
-    if TYPE_CHECKING:
-        address: int
-        words: tuple[Word, ...]
-        function: Literal[5, 6, 16]
+    address: int
+    words: tuple[Word, ...]
+    function: Literal[5, 6, 16]
 
     @property
     def count(self) -> int:
@@ -187,8 +179,7 @@ class Frame(Table):
 class Frames(Table):
     """Frames that are written one after another."""
 
-    if TYPE_CHECKING:
-        write: Sequence[Any]
+    write: Sequence[Any]
 
     def place_of(self, name: str) -> tuple[int, Kind] | None:
         """Address and type of a named value, or None where no frame holds it."""

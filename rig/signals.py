@@ -16,7 +16,6 @@ STOPS = (
     signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP,
 )  # fmt: skip
 PAUSE = signal.SIGUSR1  # of the page: may come twice, and never stops
-IGNORED = (signal.SIGTTOU,)  # output from the background must not suspend it
 HANDLED_S = 0.2  # until the main thread has run a handler, unless it hangs
 
 
@@ -24,38 +23,37 @@ class Signals(Requests):
     """Ctrl-C once: finish the posture and pause. Twice, or any other signal: stop now.
 
     While armed, a signal only sets a flag, so that no frame and no line of the journal
-    is cut in two. While nothing can move it ends the program at once, but not a run
-    that is ending. Python runs handlers on the main thread. Where that hangs, on a disk
-    say, a second thread sets the flag, and the heartbeat stops the drives.
+    is cut in two; else it ends a program that is not ending. Where the main thread,
+    which runs handlers, hangs, a second one sets the flag for the heartbeat.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._previous: dict[int, Any] = {}
-        self._pipe: tuple[int, int] | None = None
+        self._pipe = -1  # that wakes the listener
 
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():
-            self._pipe = os.pipe()
-            os.set_blocking(self._pipe[1], False)
-            signal.set_wakeup_fd(self._pipe[1], warn_on_full_buffer=False)
-            listener = threading.Thread(target=self._listen, args=[self._pipe[0]])
-            listener.daemon = True
-            listener.start()
-            for number in (*STOPS, PAUSE):
-                self._previous[number] = signal.signal(number, self._handle)
-            for number in IGNORED:
-                self._previous[number] = signal.signal(number, signal.SIG_IGN)
+            far, self._pipe = os.pipe()
+            os.set_blocking(self._pipe, False)
+            signal.set_wakeup_fd(self._pipe, warn_on_full_buffer=False)
+            threading.Thread(target=self._listen, args=[far], daemon=True).start()
+            handlers: dict[int, Any] = dict.fromkeys((*STOPS, PAUSE), self._handle)
+            # Output from the background must not suspend it.
+            for number, handler in (
+                handlers | {signal.SIGTTOU: signal.SIG_IGN}
+            ).items():
+                self._previous[number] = signal.signal(number, handler)
         return self
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous = {}
-        if self._pipe is not None:
+        if self._pipe >= 0:
             signal.set_wakeup_fd(-1)
-            os.close(self._pipe[1])  # which ends the listener
-            self._pipe = None
+            os.close(self._pipe)  # which ends the listener
+            self._pipe = -1
 
     def _listen(self, pipe: int) -> None:
         interrupts = 0

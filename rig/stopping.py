@@ -1,10 +1,9 @@
 """The command ``stop``: ask who moves the device, end them, stop every drive itself.
 
 A holder of the bus that has not told its drives to stop ASK_S after it was asked is
-killed: the kernel frees lock and port. Then each drive is stopped and looked at, by
-what a session left beside the lock when it armed and what ``stop_config`` can read of
-the file; each makes up for what the other lacks. No signal ends this before the drives
-were told. Only the standard library, the lock, the drives and pyserial are loaded.
+killed. Then each drive is stopped and looked at, by what a session left beside the lock
+and what ``stop_config`` can read of the file; each makes up for what the other lacks.
+No signal ends this before, and only the standard library and pyserial are loaded.
 """
 
 from __future__ import annotations
@@ -113,11 +112,8 @@ class ArmedBus:
 
 def stop_device(path: pathlib.Path, given: bool = True) -> int:
     """Stop what is armed on the bus of rig.toml, else all that sessions of this user
-    have armed; 0 if all drives stand. ``given``: an operator named the file.
-
-    Raises:
-        Fault: no drive was told to stop.
-    """
+    have armed; 0 if all drives stand. ``given``: an operator named the file. Fault: no
+    drive was told to stop."""
     from rig.signals import Signals
 
     with Signals() as signals:
@@ -211,10 +207,8 @@ def _say(text: str) -> None:
 
 
 def stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
-    """Stop the drives that were armed last, else those of the configuration file.
-
-    Who was asked to is waited for first. ``stay``: look whether they stay, too.
-    """
+    """Stop the drives that were armed last, else those of the configuration file, once
+    who was asked to has been waited for. ``stay``: look whether they stay, too."""
     from rig.core import stop
 
     target.end()

@@ -1,7 +1,4 @@
-"""The device as one object: its drives, its phone, and the guards around them.
-
-The loops of moving and measuring read it, ask ``guard`` and look at the clock alone.
-"""
+"""The device as one object: its drives, its phone, and the guards around them."""
 
 from __future__ import annotations
 
@@ -38,14 +35,6 @@ Check = Callable[[RigConfig, Sequence[Drive], DeviceRecord], None]
 Lines = Callable[[RigConfig, Callable[..., Any]], tuple[Line, list[Drive]]]
 
 
-class Pace(NamedTuple):
-    """How fast a drive was in its longest move so far."""
-
-    way_deg: float
-    asked_deg_s: float
-    seen_deg_s: float  # at least
-
-
 class Posture(NamedTuple):
     """Where to stand, by name."""
 
@@ -78,9 +67,7 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
 
 class LineWatch:
     """The communication timeout of drives that have one: lent, and given back.
-
-    The register is journalled before it is changed: a later process can put it back.
-    """
+    Journalled before it is changed, so that a later process can put it back."""
 
     def __init__(self, drives: list[Drive], run: RunFolder) -> None:
         self._timeouts_s = run.config.comm_timeouts_s
@@ -113,10 +100,8 @@ class LineWatch:
             drive.set_watch(counts)
 
     def restore(self, standing: set[str]) -> None:
-        """Give back what was there, of the axes that stand; never raises.
-
-        A drive that was not seen to stand keeps its timeout: it stops itself.
-        """
+        """Give back what was there; never raises. A drive that was not seen to stand
+        keeps its timeout: it stops itself."""
         for drive in self._drives:
             name, error = drive.axis.name, "not seen standing"
             if (counts := self._before.pop(name, None)) is None:
@@ -159,7 +144,7 @@ class SessionRun(RunFolder):
 
 
 class Device:
-    """Drives and what they are measured with: armed explicitly, and never moved once
+    """Drives and what they are measured with: armed explicitly, not moved once
     stopped."""
 
     def __init__(self, run: SessionRun) -> None:
@@ -177,8 +162,6 @@ class Device:
         self.proof = Proof(config.axes, self.geometry, checked, run.simulated, gains)
         self.proof.stops = stop_distances(self.record, config.axes)
         self.shown = False  # each axis has turned the phone as `axes` saw it
-        self.paces: dict[str, Pace] = {}  # by axis
-        self.last_move: tuple[str, Pulses, Pulses] | None = None  # label, from, to
         self.rest: Pulses | None = None  # where it arrived,
         self.targets: list[int | None] = []  # and the drives' target registers then
         self.armed = self.pausing = False
@@ -294,11 +277,9 @@ class Device:
         return reading.value
 
     def await_stream(self) -> Reading:
-        """The newest reading, once it is fresh, while nothing moves.
-
-        A phone that saves power holds its Wi-Fi now and then; ``paused_s`` counts it.
-        PauseRequested: not within PATIENCE_S. MotionFault: a drive moves.
-        """
+        """The newest reading, once it is fresh, while nothing moves: Wi-Fi that saves
+        power pauses, as ``paused_s`` counts. PauseRequested: not within PATIENCE_S.
+        MotionFault: a drive moves."""
         begun = time.monotonic()
         while True:
             try:
@@ -319,11 +300,9 @@ class Device:
         return reading
 
     def moved(self, change: Array, middle: Array) -> Array | None:
-        """(n,) by which the axes moved, of an (m,) change of what is measured.
-
-        Of numbers by what `axes` saw, or a model says at the ``middle`` (n,) of the
-        way; None where that is not known, or does not tell.
-        """
+        """(n,) by which the axes moved, of an (m,) change of what is measured: of
+        numbers by what `axes` saw, or a model says at the ``middle`` (n,) of the way.
+        None where that is not known, or does not tell."""
         if self.geometry.of_joints:
             return change
         if self.predict is not None:

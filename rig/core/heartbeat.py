@@ -1,8 +1,5 @@
-"""What stops the drives when the session cannot: the latch, and the thread that looks.
-
-The motion loop tells that it is alive; where it is silent for too long while the device
-moves, or the computer slept, the drives are stopped without it.
-"""
+"""What stops the drives when the session cannot: the latch, and the thread that looks
+whether the motion loop is alive and the computer awake."""
 
 from __future__ import annotations
 
@@ -66,10 +63,8 @@ class Stopper:
 
 
 class Heartbeat(threading.Thread):
-    """Stops the drives when the motion loop is silent, or does not answer a stop.
-
-    It also keeps the line alive for drives that watch it while nothing moves.
-    """
+    """Stops the drives when the motion loop is silent, or does not answer a stop; keeps
+    the line alive for drives that watch it while nothing moves."""
 
     def __init__(self, stopper: Stopper, requests: Requests, config: RigConfig) -> None:
         super().__init__(name="heartbeat", daemon=True)

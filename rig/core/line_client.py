@@ -1,7 +1,6 @@
-"""The line and drives of a session whose port another process owns.
+"""The line and drives of a session whose port another process owns, ``line_process``.
 
-They are used like those of ``rig.drives``: each method is asked of ``line_process``. A
-stop has a channel of its own, and goes before what was asked earlier. Should that
+A stop has a channel of its own, and goes before what was asked earlier. Should that
 process end, this one opens the port for a stop, and for nothing else.
 """
 
@@ -126,9 +125,7 @@ class LineClient(Line):
 
     def ask(self, axis: int | None, method: str, *args: Any) -> Any:
         """What a method of the line, or of the drive of an axis, returns there.
-
-        Raises BusError: as there; or the process has ended, or does not answer.
-        """
+        BusError: as there; or the process has ended, or does not answer."""
         urgent = self._urgent and self._owner == threading.get_ident()
         if self._gone and urgent:
             with self._own.urgent(self._timeout_s):

@@ -1,10 +1,9 @@
 """The process that owns a session's port, and stops the drives when the session dies.
 
-A session asks it over JSON lines for ``METHODS``, those of a stop over a channel of
-their own. It refuses what leaves its own reading of bus, units, maps, limits and pace.
-A thread of the session writes a sign of life every 50 ms; where that ends while a drive
-moves, or its pipe is closed, the drives are stopped here, and the lock is held till
-then. It loads the standard library, lock and drives alone, and pyserial for its ports.
+Asked over JSON lines for ``METHODS``, over a channel of its own for a stop, it refuses
+what leaves its own reading of bus, units, maps, limits and pace. Where the session's
+sign of life, written every 50 ms, ends while a drive moves, or its pipe is closed, it
+stops the drives and holds the lock till then. It loads no package but pyserial.
 """
 
 from __future__ import annotations

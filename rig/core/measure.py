@@ -33,10 +33,9 @@ def measure(standing: Arrival, samples: int | None = None) -> dict[str, Any]:
     """Wait until a device at a posture has settled, then average so many readings.
 
     Returns:
-        For the journal: ``pulses`` commanded and ``feedback`` of the drives;
+        For the journal: ``pulses`` commanded, ``feedback`` of the drives;
         ``commanded_deg``, ``measured_deg`` and, of single readings, ``std_deg``;
-        ``samples``; ``attitude`` (3, 3), the mean of the phone's; ``quaternions`` and
-        ``stamps`` of every reading.
+        ``samples``; ``attitude`` (3, 3), their mean; every single reading.
 
     Raises MotionFault: it does not settle in time, or the IMU disagrees with the
     drives. ReadingError, BusError, StopRequested: stop everything.

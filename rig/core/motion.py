@@ -8,10 +8,10 @@ import time
 from typing import NamedTuple
 
 from rig.config.axis import Axis, Pulses
-from rig.core.device import Device, Pace, Posture, approach, check_plan
+from rig.core.device import Device, Posture, approach, check_plan
 from rig.drives.drive import START_S, STILL_COUNTS, Drive, Status
 from rig.drives.line import BusError
-from rig.faults import EndedShort, MotionFault, Unreachable
+from rig.faults import MotionFault, Unreachable
 from rig.readings.attitude import Array
 
 DEADLINE_FACTOR, DEADLINE_SLACK_S = 2.0, 2.0  # of a move's computed time, and more
@@ -33,9 +33,8 @@ class Arrival(NamedTuple):
 def move(device: Device, posture: Posture) -> Arrival:
     """Move all axes to a posture, in pieces, from the chosen side.
 
-    Raises LimitError: the target leaves the limits; nothing was sent. Unreachable: a
-    drive refused the target. EndedShort: a drive ended short of it. MotionFault,
-    BusError, ReadingError, StopRequested: stop everything.
+    LimitError: outside the limits, nothing was sent. Unreachable: a drive refused the
+    target. MotionFault, BusError, ReadingError, StopRequested: stop everything.
     """
     if not device.armed:
         raise MotionFault("not armed")
@@ -64,8 +63,6 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
     for index, drive in enumerate(device.drives):
         drive.axis = proof.paced(index, end[index] - here[index], end[index])
     device.untrack()  # until it arrives
-    if end != here:
-        device.last_move = label, here, end
     device.heartbeat.feed(moving=True)
     try:
         for index, (drive, pulses) in enumerate(zip(device.drives, end, strict=True)):
@@ -125,9 +122,9 @@ def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
 def took(drive: Drive, pulses: int, start: Status, tolerance: int) -> bool | None:
     """Whether the drive obeys a move whose reply was lost; None: unknown.
 
-    A drive that obeys moves, has left ``start`` by more than ``tolerance`` pulses,
-    or stands at its target. One that does not holds another target, or has stood
-    idle at ``start`` for START_S. MotionFault: it is in alarm.
+    A drive that obeys moves, has left ``start`` by more than ``tolerance`` pulses, or
+    is at its target. One that does not holds another target, or has stood idle at
+    ``start`` for START_S. MotionFault: it is in alarm.
     """
     begun = time.monotonic()
     while True:
@@ -218,13 +215,12 @@ def _stalled(
     end, angle = map(axis.to_deg, (goal, status.position))
     short_by = abs(end - angle)
     if status.done and not status.moving and moved:
-        return EndedShort(
+        return MotionFault(
             f"{axis.name} stopped {short_by:.3f} {axis.unit_name} short of its "
             f"target, at {angle:.3f}, and its drive reports the move as done. Find "
             "out what stopped it: another controller, an emergency stop that was "
-            "released, or a limit of the drive",
-            axis.name, status.position,
-        )  # fmt: skip
+            "released, or a limit of the drive that session.*_range_deg must not reach"
+        )
     return MotionFault(
         f"{axis.name} does not follow: it has been {short_by:.3f} {axis.unit_name} "
         f"from its target for {stood_s:.2f} s (limit motion.stall_s = {stall_s:g}). "
@@ -239,14 +235,11 @@ def _check_speed(device: Device, axis: Axis, seen: list[Status]) -> None:
     # that a slow reply makes no speed; nor do counts by which two readings may differ.
     (first, *_, last), asked = seen, axis.drive_motion[0]
     marks = [s for s in seen[1:-1] if last.time - s.asked > SPAN_S]
-    speed = way = 0.0
+    speed = 0.0
     for mark in (*marks[-1:], first):
         counts = abs(last.position - mark.position) - STILL_COUNTS
         way = abs(axis.to_deg(max(0, counts)))
         speed = max(speed, way / (last.time - mark.asked))
-    before = device.paces.get(axis.name)
-    if before is None or way > before.way_deg:
-        device.paces[axis.name] = Pace(way, asked, speed)
     slowest = min(LEAST_TURNS_S / axis.turns_per_deg, LEAST_DEG_S)
     if speed > max(TOO_FAST * asked, slowest) and not device.simulated:
         raise MotionFault(

@@ -89,10 +89,8 @@ class StopDistance(NamedTuple):
         return speed * self.delay_s + speed**2 * self.per_square
 
     def fastest(self, axis: Axis, room: float) -> float:
-        """Speed of a move that ends so far before a limit, whenever it is stopped.
-
-        A quick stop may brake by the move's ramp: where that is gentler now, so is it.
-        """
+        """Speed of a move that ends so far before a limit, whenever it is stopped. A
+        quick stop may brake by the move's ramp: where that is gentler now, so is it."""
         speed, accel = axis.drive_motion
         square = MARGIN * self.per_square * max(1.0, self.accel / accel)
         excess, room = square - 0.5 / accel, max(room, LEAST_ROOM_DEG)
@@ -150,11 +148,10 @@ def slopes(predict: Callable[[Array], Array], at_deg: Array) -> Array:
 
 
 def unit_proved(imu: ImuSettings | ReadingsSettings, attitude: Array) -> bool:
-    """Whether a phone's (3, 3) attitude can only have come in the configured unit.
-
-    Numbers have the unit that they are given, quaternions none. A number over 2 pi is
-    no angle in radians; degrees read as radians show in the first move, 57.3 times.
-    """
+    """Whether a phone's (3, 3) attitude can only have come in the configured unit: a
+    number over 2 pi is no angle in radians, and degrees read as radians show in the
+    first move, 57.3 times. Numbers have the unit that they are given, quaternions
+    none."""
     if isinstance(imu, ReadingsSettings) or imu.by_quaternion or imu.unit == "rad":
         return True
     sent = matrix_to_euler(attitude, str(imu.order))
@@ -212,10 +209,8 @@ class Reach:
         self.deg_per_pulse = most / self.longest
 
     def unseen(self, begun: int, here: int, goal: int) -> int:
-        """Pulses towards a goal that may be gone without the phone's word.
-
-        Raises MotionFault: so many were gone already.
-        """
+        """Pulses towards a goal that may be gone without the phone's word; MotionFault
+        where so many were gone already."""
         axis = self.axis
         most = max(1, int(axis.motor_pulses(UNSEEN_MOTOR_DEG)))
         gone = abs(here - begun)
@@ -284,10 +279,8 @@ class Proof:
         self._start = None
 
     def begin(self, imu: Source, attitude: Array, here: Pulses, goal: Pulses) -> Pulses:
-        """The end of the next piece of the way from here to a goal.
-
-        MotionFault: an axis was moved as far as may be, and nothing was seen.
-        """
+        """The end of the next piece of the way from here to a goal. MotionFault: an
+        axis was moved as far as may be, and nothing was seen."""
         unproved = [reach for reach in self.reaches if not reach.checked]
         if unproved and self._near is None:
             self.stay_near(attitude)

@@ -1,8 +1,7 @@
 """Whether it is the device of the record, and stands where it stood.
 
-Before it is armed: its drives, and their counts. Once it is measured: the attitude of
-its zero posture. The phone's world stands upright, so a change of tilt is seen whatever
-it calls north; turns about the vertical too where ``imu.heading = "absolute"``.
+Before it is armed by its drives and their counts; then by the attitude of its zero
+posture: by its tilt, and with ``imu.heading = "absolute"`` by its heading.
 """
 
 from __future__ import annotations
@@ -31,11 +30,8 @@ def check_drives(
     record: DeviceRecord,
     geared: bool = True,
 ) -> None:
-    """The drives are those of the record, where they were, and geared as configured.
-
-    Raises Refused: they are not. What no longer holds of the record is voided.
-    BusError: a drive does not answer.
-    """
+    """The drives are those of the record, where they were, and geared as configured;
+    Refused where not, and what no longer holds of the record is voided."""
     for drive in drives if geared else ():
         axis, told = drive.axis, drive.pulses_per_rev()
         if told is not None and told != axis.pulses_per_rev:
@@ -100,9 +96,7 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
 
 def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
     """Keep where the drives stand, as far as they say; an alarm takes their place.
-
-    Raises OSError: the record cannot be written.
-    """
+    OSError: the record cannot be written."""
     positions: dict[str, int | None] = {}
     homed: list[str] = []
     for drive in drives:
@@ -132,10 +126,8 @@ class ZeroRecord(NamedTuple):
     attitude: Array  # (3, 3) phone to its world
 
     def check(self, config: RigConfig, pulses: Pulses, attitude: Array) -> str:
-        """The zero posture taken now is this one; returns what was compared, in words.
-
-        Raises MotionFault: it is not, by more than ``session.reference_tolerance_deg``.
-        """
+        """The zero posture taken now is this one: what was compared, in words.
+        MotionFault: it is not, by more than ``session.reference_tolerance_deg``."""
         off = config.to_deg(np.subtract(pulses, self.pulses))
         if np.abs(off).max() > config.session.reference_tolerance_deg:
             told = axes_text(config.axis_names, config.axis_unit, off)
@@ -148,21 +140,17 @@ class ZeroRecord(NamedTuple):
 
 
 def moved(config: RigConfig, then: Array, now: Array) -> tuple[float, Array]:
-    """How far two readings of the zero posture are apart, and (m,) of that.
-
-    Without an absolute heading a turn about the vertical is taken out of both.
-    """
+    """How far two readings of the zero posture are apart, and (m,) of that; without a
+    turn about the vertical, unless the heading is absolute."""
     geometry = geometry_of(config)
     now = geometry.aligned(then, now)
     return geometry.apart(then, now), geometry.frame(then).angles(now)
 
 
 def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
-    """The zero posture stands as it stood: what was compared, in words.
-
-    MotionFault: the phone's (3, 3) attitudes ``then`` and ``now`` differ by more than
-    ``session.reference_tolerance_deg``.
-    """
+    """The zero posture stands as it stood: what was compared, in words. MotionFault:
+    (3, 3) ``then`` and ``now`` differ by more than
+    ``session.reference_tolerance_deg``."""
     limit = config.session.reference_tolerance_deg
     angle, joints = moved(config, then, now)
     blind, unit = geometry_of(config).unseen(then), config.output_unit

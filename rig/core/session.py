@@ -1,13 +1,8 @@
 """A session: arm, take the zero, visit, identify; stopped on every way out.
 
-    with open_device(run) as device:
-        take_zero(device)
-        found = [visit(device, posture) for posture in plan]
-    calibration = identify(found)
-
-All that happens is an event of the run: it is journalled, and console, page, telemetry
-and simulator listen. What the journal holds already is not measured again, so resuming
-is running the same again.
+All that happens is an event of the run: journalled, and told to console, page,
+telemetry and simulator. What the journal holds is not measured again: resuming is
+running the same again.
 """
 
 from __future__ import annotations
@@ -25,25 +20,16 @@ from rig.core.measure import measure, zeroed
 from rig.core.motion import Arrival, move
 from rig.core.proof import Turns, slopes
 from rig.core.record_check import ZeroRecord
-from rig.faults import (
-    EndedShort,
-    MotionFault,
-    NotFollowing,
-    TurnedTooFar,
-    Unreachable,
-    ending,
-)
+from rig.faults import MotionFault, NotFollowing, TurnedTooFar, Unreachable, ending
 from rig.journal.device import SIGN_CHECKED, ZEROED
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import Record, RunFolder
 from rig.readings.attitude import Array, angle_between_deg
 from rig.readings.geometry import Attitudes
-from rig.readings.source import ReadingError
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 LEAST_TURN_DEG = 0.05  # of the phone's heading: less is its noise
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
-SAME_PLACE_DEG = 0.5  # two places where an axis ended short of one target
 SHOWN_DEG = 3.0  # that each axis is moved, from a third of it to the whole
 RATIO = (2 / 3, 4 / 3)  # of what `axes` saw
 ASIDE_DEG = 4.0  # between the axes of two turns, and ...
@@ -53,10 +39,7 @@ SURE_SIGMA = 4.0  # ... of what the noise of the readings makes
 @contextlib.contextmanager
 def open_device(run: SessionRun) -> Iterator[Device]:
     """The device of a run, armed; however this ends its drives are stopped and looked
-    at.
-
-    Raises MotionFault, BusError, ReadingError, Refused: not fit to move.
-    """
+    at. MotionFault, BusError, ReadingError, Refused: not fit to move."""
     config, record, requests = run.config, run.record, run.signals
     device, lock = Device(run), BusLock(config.bus)
     # A request that came while something was computed may have been raised in a
@@ -95,32 +78,6 @@ def open_device(run: SessionRun) -> Iterator[Device]:
                     lock.stood(forget=gone)
                 if reason and not all(r.standing for r in device.stopper.stay()):
                     lock.leave(config)
-                if reason and device.last_move:
-                    device.emit("last_move", **_last_move(device))
-
-
-def _last_move(device: Device) -> Record:
-    """What moved last, from where to where, and where drives and phone are now."""
-    assert device.last_move is not None
-    config, (label, start, end) = device.config, device.last_move
-    stands = [result.position for result in device.stopper.results]
-    phone = None
-    with contextlib.suppress(ReadingError):
-        if device.oriented and device.frame:
-            phone = device.frame.angles(device.imu.latest().value).round(3).tolist()
-    return {
-        "label": label,
-        "axes": list(config.axis_names),
-        "units": [axis.unit_name for axis in config.axes],
-        "outputs": list(config.output_names),
-        "from_deg": config.to_deg(start).round(3).tolist(),
-        "to_deg": config.to_deg(end).round(3).tolist(),
-        "drives_deg": [
-            None if at is None else round(axis.to_deg(at), 3)
-            for axis, at in zip(config.axes, stands, strict=True)
-        ],
-        "phone_deg": phone,
-    }
 
 
 def _close(device: Device) -> None:
@@ -141,12 +98,9 @@ def _close(device: Device) -> None:
 def take_zero(
     device: Device, at: Pulses | None = None, kept: ZeroRecord | None = None
 ) -> None:
-    """Measure the zero posture, that all others are measured against.
-
-    In a run that is resumed it must still read zero. It is ``at`` these pulses, or
-    where the device stands, or 0 as configured; ``kept``: as a calibration kept it,
-    else MotionFault.
-    """
+    """Measure the zero posture, that all others are measured against: ``at`` these
+    pulses, or where the device stands, or 0 as configured. In a run that is resumed it
+    must still read zero, with ``kept`` be that of a calibration; else MotionFault."""
     config, run = device.config, device.run
     if zeros := run.journal.events("zero"):
         before = Posture("reference", tuple(zeros[-1]["pulses"]))
@@ -262,14 +216,6 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
     except NotFollowing:
         _withdraw(run)
         raise
-    except EndedShort as fault:
-        ended = {"name": name, "axis": fault.axis, "pulses": fault.pulses}
-        twice = _ended_there(device, ended)
-        device.emit("ended_short", sync=True, **ended)
-        if not twice:  # going on is typed
-            raise
-        _leave_out(device, name, f"{fault}. It ended there before")
-        return None
     except Unreachable as reason:
         _leave_out(device, name, str(reason))
         return None
@@ -287,17 +233,6 @@ def _withdraw(run: RunFolder) -> None:
     names = [n for n, record in run.postures().items() if record["seq"] > since]
     if names:
         run.emit("void", sync=True, names=names)
-
-
-def _ended_there(device: Device, ended: Record) -> bool:
-    """Whether this axis ended short at this place before, on the way to a posture."""
-    axis = next(axis for axis in device.config.axes if axis.name == ended["axis"])
-    near, same = axis.pulses_within(SAME_PLACE_DEG), (ended["name"], ended["axis"])
-    return any(
-        (record["name"], record["axis"]) == same
-        and abs(record["pulses"] - ended["pulses"]) <= near
-        for record in device.run.journal.events("ended_short")
-    )
 
 
 def _leave_out(device: Device, name: str, reason: str) -> None:
@@ -373,7 +308,6 @@ def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> 
     device.emit(
         "shown", sync=True, axis=axis.name, ratio=round(size, 4),
         before=round(before, 4), aside_deg=round(float(aside), 2),
-        speed_deg_s=round(device.paces[axis.name].seen_deg_s, 2),
     )  # fmt: skip
     fault = ""
     if not RATIO[0] <= share <= RATIO[1]:

@@ -1,8 +1,5 @@
-"""Stopping: every unit, whatever happened, and proof that it stands.
-
-A stop goes to each unit by itself, to those that answered last first, and goes on past
-units that fail. It is repeated (unlike a move) and verified by reading the status back.
-"""
+"""Stopping: every unit by itself, whatever happened, and proof that it stands. A stop
+is repeated (unlike a move) and verified by reading the status back."""
 
 from __future__ import annotations
 
@@ -47,8 +44,7 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
     """Quick-stop every drive of one bus, and wait for them to come to rest.
 
     The first round waits a short time for each reply, so that a dead unit delays the
-    others by no more than that; the next as long as configured, for those that have not
-    acknowledged. Never raises, never leaves one out.
+    others little; the next as long as configured. Never raises, never leaves one out.
     """
     results = [UnitStop(d.axis.name, d.axis.unit) for d in drives]
     if not drives:
@@ -117,10 +113,8 @@ def _verify(pairs: Pairs) -> None:
 
 def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[str]:
     """What goes on by itself after a stop, in words; it is stopped, as ``results`` say.
-
     Where the map can, what drives stand at becomes their target first. A drive without
-    power may sink; that is no restart.
-    """
+    power may sink; that is no restart."""
     pairs = list(zip(drives, results, strict=True))
     words: list[str] = []
     for _ in range(ROUNDS):

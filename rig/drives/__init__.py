@@ -1,8 +1,5 @@
-"""What moves: drives on their line, by the kind that each axis's map names.
-
-``line`` and ``drive`` are what motion and stop ask; ``modbus`` is a kind. A kind of
-one's own is a class that a map names; ``examples/drives`` has two.
-"""
+"""What moves: drives on their line, by the kind that each axis's map names. A kind of
+one's own is a class that a map names; ``examples/drives`` has two."""
 
 from __future__ import annotations
 

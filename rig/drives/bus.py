@@ -1,8 +1,7 @@
 """Modbus: the line. ``wire`` does the framing.
 
-Replies are checked against their request, the silence between frames is kept, reads are
-retried, and a motion write is sent exactly once. RTU frames bear no number: after a
-failed exchange the line is emptied, and a unit that owes a reply is asked for another
+Reads are retried, a motion write is sent exactly once. RTU frames bear no number: after
+a failed exchange the line is emptied, and a unit that owes a reply is asked for another
 number of registers first, until what it answers can only be the answer to that.
 """
 
@@ -158,11 +157,8 @@ class Bus(Line):
         """The data of ``quantity`` registers, two bytes each, or bits from the lowest.
 
         ``function``: 3 holding or 4 input registers, 1 coils, 2 discrete inputs;
-        ``retries`` after the first try, where not as ``Line.read_tries``.
-
-        Raises:
-            BusError: no valid reply after all tries.
-            Rejected: the drive answered with an exception, every time.
+        ``retries`` after the first try, where not as ``Line.read_tries``. BusError: no
+        valid reply after all tries; Rejected: an exception, every time.
         """
         tries = self.read_tries if retries is None else 1 + retries
         size, what = data_size(function, quantity), "registers"

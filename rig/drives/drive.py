@@ -1,8 +1,7 @@
 """A drive, as motion, proof and stop know it: one axis of one line.
 
-A kind of drive writes ``ids``, ``arm``, ``position``, ``move``, ``standing``, ``stop``
-and ``alarm``; what follows from them is here, and is the same for every kind. Counts
-are the drive's own; pulses are counts from its origin.
+A kind of drive writes the abstract methods; what follows from them is here. Counts are
+the drive's own; pulses are counts from its origin.
 """
 
 from __future__ import annotations

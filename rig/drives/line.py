@@ -1,8 +1,4 @@
-"""What the drives of a device are reached over: used by several threads, and kept for a
-stop.
-
-A kind of line says how a request is sent and answered; see docs/rig/drives.md.
-"""
+"""What drives are reached over, by several threads; see docs/rig/drives.md."""
 
 from __future__ import annotations
 

@@ -154,11 +154,8 @@ class ModbusDrive(Drive):
         return max(1, math.ceil(seconds * self.map.comm_timeout.per_s - 1e-9))
 
     def write(self, table: Frames | None, **values: float) -> None:
-        """Send the frames of one of the map's tables; none where the map lacks it.
-
-        What moves the drive, or stops it, is sent once; the rest may be written twice,
-        and is retried as reads are.
-        """
+        """Send the frames of one of the map's tables; none where the map lacks it. What
+        moves the drive, or stops it, is sent once; the rest is retried as reads are."""
         once = any(
             table is motion for motion in (self.map.move, self.map.home, self.map.stop)
         )

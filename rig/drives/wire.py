@@ -1,11 +1,10 @@
 """Modbus frames on one connection: numbered over TCP; with a CRC on a serial port, or
 through a socket.
 
-A reply over TCP bears its request's number: a late one is dropped and the connection
-kept, since a gateway may give no other for seconds. Gateways serve one request after
-the other, so the same is asked but a few times: little stands in the way of a stop. A
-reply of RTU is looked for in all that came, past an adapter's echo and noise.
-"""
+A late reply over TCP is dropped by its number and the connection kept, since a gateway
+may give no other for seconds. It serves one request after the other, so the same is
+asked but a few times: little stands in the way of a stop. A reply of RTU is looked for
+in all that came, past an adapter's echo and noise."""
 
 from __future__ import annotations
 

@@ -1,10 +1,9 @@
 """What small moves of the drives say about a device: axes, signs, gearing, placement.
 
 Everything is taken from rotations of the phone against its attitude at the start, in
-(3,) degrees of its own frame there: neither its heading nor the zero posture enters. A
-drive's axis, with its sign, is the direction of its rotation vector for positive
-pulses. By these alone a phone placed differently looks like drives whose names and
-signs are exchanged, so the configured placement is known, as good as ``NEAREST``.
+(3,) degrees of its own frame there: neither heading nor zero posture enters. By these
+alone a phone placed differently looks like drives whose names and signs are exchanged,
+so the configured placement is known, as good as ``NEAREST``.
 """
 
 from __future__ import annotations
@@ -145,9 +144,9 @@ def check_numbers(
 ) -> tuple[list[Change], list[float]]:
     """Corrections of directions, and what numbers change for a unit of each axis.
 
-    A number of the name of an axis rises with that axis; where it has its unit too, it
-    changes about as far. Or they change as a model says, ``expected`` (m, n) for a unit
-    of each axis. MotionFault: by far more, or less.
+    A number of an axis's name rises with it and, in its unit, about as far; or numbers
+    change as a model says, ``expected`` (m, n) for a unit of each. MotionFault: by far
+    more, or less.
     """
     rates, changes, low, high = rates_of(config, stands), [], *SOUND_RATIO
     ratios = []
@@ -213,15 +212,10 @@ class Findings:
 def find(
     config: RigConfig, stands: Mapping[str, Stand], expected: Array | None = None
 ) -> Findings:
-    """Read the findings from the places that ``measure_axes`` went to.
+    """The findings of ``stands``, the places that ``measure_axes`` went to, by name.
 
-    Args:
-        config: as the moves were made.
-        stands: ``start``; of each axis NAME ``NAME:look``, ``:plus``, ``:back``,
-            ``:minus``; of each of ``corners_of`` its ``corner_name``.
-        expected: (3, n) axes of an arm's joints in its tip's frame at the start.
-
-    Raises MotionFault: the axes fit no joints, or the readings are no rotations.
+    ``expected``: (3, n) axes of an arm's joints in its tip's frame at the start.
+    MotionFault: the axes fit no joints, or the readings are no rotations.
     """
     rates = rates_of(config, stands)
     size = np.linalg.norm(rates, axis=0)
@@ -318,9 +312,9 @@ def require_unit(
     """MotionFault where the phone's unit is not the configured one, or not clear.
 
     Two gearings of the file that agree with the phone prove it (of a single axis the
-    one): both would have to be wrong by 57.3. A gearing is corrected only where the
-    unit is proved. ``ratios`` are measured against commanded, by the drives' own
-    registers where they have one; ``proved``: not all turn as if it were the other.
+    one): both would have to be wrong by 57.3. ``ratios`` are measured against
+    commanded, by the drives' own registers where they have one; ``proved``: not all
+    turn as if it were the other.
     """
     unit = config.phone.unit
     other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
@@ -343,11 +337,9 @@ def require_unit(
 def require_gearing(
     config: RigConfig, ratios: Sequence[float], told: Sequence[int | None]
 ) -> None:
-    """MotionFault where a gearing off by more than 2 has no second proof.
-
-    That is the drive's own register (``told`` pulses for one turn, or None), or another
-    axis that turns as it is told: what is off on all may be the phone, or the file.
-    """
+    """MotionFault where a gearing off by more than 2 has no second proof: the drive's
+    own register (``told`` pulses for one turn, or None), or another axis that turns as
+    it is told. What is off on all may be the phone, or the file."""
     low, high = SOUND_RATIO
     if any(low <= ratio <= high for ratio in ratios):
         return
@@ -369,10 +361,8 @@ def _seen(config: RigConfig, ratios: Sequence[float]) -> str:
 def proposals(
     config: RigConfig, findings: Findings, told: Sequence[int | None]
 ) -> list[Change]:
-    """Corrections of a configuration whose phone's unit is proved.
-
-    ``told``: pulses for one turn by each drive's own word, None where it has none.
-    """
+    """Corrections of a configuration whose phone's unit is proved; ``told``: pulses for
+    one turn by each drive's own word, None where it has none."""
     tables = {table["name"]: table for table in tomllib.loads(config.text)["axes"]}
     changes: list[Change] = []
     low, high = SOUND_RATIO

@@ -41,11 +41,8 @@ SEEN_SIGMA = 6.0
 
 
 def check_axes(run: Run, device: Device) -> list[Change]:
-    """Move, measure and say what is found; the corrections that follow from it.
-
-    Where nothing is to be corrected the device is SIGN_CHECKED, and once every way to
-    stop it has been tried, STOP_PROVED.
-    """
+    """Move, measure, say what is found; the corrections that follow. Without any the
+    device is SIGN_CHECKED and, once every way to stop it was tried, STOP_PROVED."""
     config, stands = run.config, measure_axes(run, device)
     start, model, expected = stands["start"].pulses, run.model, None
     more: dict[str, float] = {}
@@ -72,12 +69,6 @@ def check_axes(run: Run, device: Device) -> list[Change]:
         "run": run.folder.name,
     }
     run.emit("axes", sync=True, **evidence, changes=[str(change) for change in changes])
-    for axis in config.axes:
-        pace = device.paces[axis.name]
-        run.say(
-            f"  {axis.name}: at least {pace.seen_deg_s:.3g} {axis.unit_name}/s, "
-            f"commanded {pace.asked_deg_s:.3g}"
-        )
     if not changes:
         scales = [axis.pulses_per_deg for axis in config.axes]
         turned = (rates_of(config, stands) * scales).round(6).tolist()
@@ -89,12 +80,9 @@ def check_axes(run: Run, device: Device) -> list[Change]:
 
 
 def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
-    """Visit the places that ``axis_check.find`` reads from, and come back.
-
-    Raises Refused: an axis stands too near to a limit. MotionFault: an axis does not
-    turn the phone, or turns it too far, or the unit of the phone's angles is not the
-    one that is configured.
-    """
+    """Visit the places that ``axis_check.find`` reads from, and come back. Refused: an
+    axis stands too near to a limit. MotionFault: one does not turn the phone, or too
+    far, or the unit of the phone's angles is not the configured one."""
     config, start = run.config, device.positions()
     room = [_room_deg(axis, at) for axis, at in zip(config.axes, start, strict=True)]
     # Of numbers it does not matter which axis carries which; of an arm it is known.

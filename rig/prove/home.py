@@ -40,10 +40,8 @@ def can_home(config: RigConfig) -> bool:
 
 def home(run: Run, device: Device, config: RigConfig, here: bool) -> None:
     """Make the counts of ``unlimited`` drives mean a place; the device is HOMED.
-
-    ``config`` has the limits, by which a homing is watched. ``here``: the device stands
-    at home, and each drive is told so, or its count is noted; else it homes itself.
-    """
+    ``config``'s limits watch a homing. ``here``: the device stands at home, and each
+    drive is told so, or its count is noted; else it homes itself."""
     for drive, axis in zip(device.drives, config.axes, strict=True):
         if here:
             _set_zero(run, device, drive)

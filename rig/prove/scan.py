@@ -48,10 +48,8 @@ class Answer:
 
 
 def parse_bus(text: str) -> BusSettings:
-    """Settings of ``tcp:HOST[:PORT]``, ``rtu:/dev/ttyUSB0,115200,N,8,1`` and the like.
-
-    Raises ConfigError: not such a text, or settings that cannot be.
-    """
+    """Settings of ``tcp:HOST[:PORT]``, ``rtu:/dev/ttyUSB0,115200,N,8,1`` and the like;
+    ConfigError where it is no such text, or they cannot be."""
     if (values := place_of(text, OF_LINE)) is None:
         kinds = "tcp:HOST[:PORT], rtu_tcp:HOST[:PORT], serial:DEVICE[,BAUD], "
         kinds += "can:CHANNEL[,BAUD] or rtu:DEVICE"
@@ -91,10 +89,8 @@ def scan(
     say: Callable[[str], None],
     maps: tuple[DriveMap, ...] = (),
 ) -> list[Answer]:
-    """Ask units 1 to ``units`` for their identity; ``maps`` beside those that ship.
-
-    It holds the lock of the bus until it ends.
-    """
+    """Ask units 1 to ``units`` for their identity, under the lock of the bus; ``maps``
+    beside those that ship."""
     every = [*maps, *(load_map(name) for name in available_maps())]
     named = {drive_map.name: drive_map for drive_map in every}.values()
     families = [drive_map for drive_map in named if isinstance(drive_map, RegisterMap)]

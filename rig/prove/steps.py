@@ -52,10 +52,8 @@ class Operator:
         self._option = option
 
     def ask(self, question: str, default: str = "") -> str:
-        """An answer, or the default where none is given.
-
-        Raises Refused: there is no terminal to ask on and no --yes, or no default.
-        """
+        """An answer, or the default where none is given; Refused where there is neither
+        a terminal nor --yes, or no default."""
         if self.yes and not default:
             raise Refused(f"{question}: no default; pass it as an option")
         if self.yes:
@@ -215,10 +213,8 @@ def number_of(config: RigConfig, name: str) -> int:
 
 
 def jog(site: Site, name: str, way_deg: float) -> int:
-    """Move one axis by so many degrees, cut at its limits.
-
-    Where its gearing is not proved it stops once the phone has turned so far.
-    """
+    """Move one axis by so many degrees, cut at its limits. Where its gearing is not
+    proved it stops once the phone has turned so far."""
     axis = number_of(site.config, name)
     unit = site.config.axes[axis].unit_name
     homed = site.record.missing(site.config, HOMED) is None
@@ -314,10 +310,8 @@ def commissioned(path: pathlib.Path, config: RigConfig, through: str) -> DeviceR
 
 def edit(path: pathlib.Path, values: Mapping[str, Any]) -> RigConfig:
     """Set keys of a configuration such as ``axes.roll.unit``; None takes one out.
-
-    Comments and layout stay, and the old file beside it. The new one appears at once
-    and whole; ConfigError: it would not be valid, and the file is as it was.
-    """
+    Comments and layout stay, the old file lies beside it, the new one appears whole.
+    ConfigError: it would not be valid, and the file is as it was."""
     text = read_text(path)
     edited = set_values(text, values)
     config = parse_config(edited, path.parent, str(path))

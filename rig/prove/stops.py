@@ -2,10 +2,9 @@
 
 The axes move together (one by one where their line moves them in turn), 3 degrees or
 mm either side, less of more than three, and are stopped on the way: by the frame to
-each unit, by the broadcast and by the drives' own watch of the line where they have
-one. Each must stand short of its target, by drive and phone, and stay there. The stop
-of each unit is tried again in a faster move: how far an axis went on at either speed
-says how fast it may be near a limit.
+each unit, the broadcast and the drives' own watch of the line. Each must stand short of
+its target, by drive and phone, and stay there. How far they went on, there and in a
+faster move, says how fast an axis may be near a limit.
 """
 
 from __future__ import annotations
@@ -61,10 +60,8 @@ class StopTrial(NamedTuple):
 
 
 def prove_stops(run: Run, device: Device) -> None:
-    """Try each way to stop; the device is STOP_PROVED.
-
-    Raises MotionFault: an axis went on, or moved again.
-    """
+    """Try each way to stop; the device is STOP_PROVED. MotionFault: an axis went on, or
+    moved again."""
     start, axes = device.positions(), run.config.axes
     evidence: dict[str, dict[str, float]] = {}
     distances: dict[str, dict[str, Any]] = {}

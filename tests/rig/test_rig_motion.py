@@ -364,22 +364,12 @@ def test_a_count_that_jumps_is_no_speed(counts, fast, monkeypatch):
         name="x", unit_name="mm", map=config, drive_motion=(0.002, 0.02),
         to_deg=lambda count: count / 1000.0, turns_per_deg=1.0,
     )  # fmt: skip
-    device = SimpleNamespace(simulated=False, paces={})
+    device = SimpleNamespace(simulated=False)
     seen = [SimpleNamespace(position=0, asked=0.0, time=0.01),
             SimpleNamespace(position=counts, asked=0.5, time=0.51)]  # fmt: skip
     told = pytest.raises(MotionFault, match=r"moves at 0\.114 mm/s or faster")
     with told if fast else contextlib.nullcontext():
         moving._check_speed(device, axis, seen)
-
-
-def test_what_moved_last_is_no_move_of_no_way():
-    with bench() as motion:
-        here = motion.device.positions()
-        motion.move_to(here, "reference")
-        assert motion.device.last_move is None
-        motion.move_to((here[0] + 100, *here[1:]), "x")
-        motion.move_to(motion.device.positions(), "reference")
-        assert motion.device.last_move[0] == "x"
 
 
 def test_a_missed_deadline_stops(monkeypatch):

@@ -100,7 +100,7 @@ def test_crawls_are_no_slower_than_a_drive_can_begin(reduction, asked, seen, fau
         )
         for t in np.arange(0.0, 2.0, 0.05)
     ]
-    fake = SimpleNamespace(paces={}, simulated=False)
+    fake = SimpleNamespace(simulated=False)
     check = moving._check_speed
     if fault:
         with pytest.raises(MotionFault, match="instead of the commanded"):
