@@ -90,8 +90,7 @@ def ending(error: BaseException, folder: pathlib.Path) -> tuple[int, str, str]:
 
 
 class Requests:
-    """What was asked of a session from outside, by flags alone: they are looked at
-    before every frame and in every loop."""
+    """What was asked of a session from outside: flags, looked at before every frame."""
 
     def __init__(self) -> None:
         self.armed = False

@@ -52,7 +52,6 @@ def decode(words: list[int], kind: Kind, word_order: str) -> float:
 
 
 def registers_of(kind: Kind) -> int:
-    """Registers that a type takes."""
     return int(kind[1:]) // 16
 
 
@@ -61,9 +60,8 @@ def word_of(word: Any) -> Word:
     if type(word) is int and 0 <= word <= 0xFFFF:
         return Word(word)
     name, _, kind = str(word).partition(":")
-    kinds: dict[str, Kind] = {form: form for form in FORMATS}
-    if isinstance(word, str) and name in VALUES and kind in kinds:
-        return Word(name, kinds[kind])
+    if isinstance(word, str) and name in VALUES and kind in FORMATS:
+        return Word(name, kind)
     raise ValueError(
         f"must be 0..65535 or NAME:TYPE with NAME of {', '.join(VALUES)} and TYPE of "
         f"{', '.join(FORMATS)}, got {word!r}"
@@ -71,7 +69,6 @@ def word_of(word: Any) -> Word:
 
 
 def registers_in(words: Sequence[Word]) -> int:
-    """Registers of all words of a frame."""
     return sum(registers_of(word.kind) for word in words)
 
 
@@ -135,7 +132,6 @@ class Bits(Table):
     clear: tuple[int, ...]
 
     def holds(self, word: int) -> bool:
-        """Whether a status word satisfies it."""
         pairs = [*((b, 1) for b in self.set), *((b, 0) for b in self.clear)]
         return all(word >> b & 1 == value for b, value in pairs)
 
@@ -169,7 +165,6 @@ class Frame(Table):
         return [COIL_ON * bool(n) for n in found] if self.function == 5 else found
 
     def places(self) -> Iterator[tuple[int, Word]]:
-        """Every word with its address."""
         address = self.address
         for word in self.words:
             yield address, word

@@ -39,10 +39,8 @@ class Signals(Requests):
             signal.set_wakeup_fd(self._pipe, warn_on_full_buffer=False)
             threading.Thread(target=self._listen, args=[far], daemon=True).start()
             handlers: dict[int, Any] = dict.fromkeys((*STOPS, PAUSE), self._handle)
-            # Output from the background must not suspend it.
-            for number, handler in (
-                handlers | {signal.SIGTTOU: signal.SIG_IGN}
-            ).items():
+            handlers[signal.SIGTTOU] = signal.SIG_IGN  # output from the background
+            for number, handler in handlers.items():
                 self._previous[number] = signal.signal(number, handler)
         return self
 

@@ -38,7 +38,6 @@ Faults = list[str]
 
 
 def where_of(bus: Any) -> str:
-    """A bus in words."""
     if bus.transport not in NETWORK:
         return f"{bus.device} at {bus.baudrate} baud"
     return f"{bus.host}:{bus.port} ({bus.transport})"
@@ -224,7 +223,6 @@ def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace |
 
 
 def _frames(table: Any) -> Frames | None:
-    """Frames of a table; None where one cannot be read."""
     rows = rows_of(table.get("write")) if rows_of(table) == [table] else []
     try:
         frames = []
@@ -298,7 +296,6 @@ def _number(
 
 
 def _decoded(data: bytes) -> str:
-    """The text of a file, whatever program wrote it."""
     utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
     return data.decode("utf-16" if utf16 else "utf-8-sig", errors="replace")
 

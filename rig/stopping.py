@@ -74,7 +74,6 @@ class ArmedBus:
         return self.armed is not None and not self.armed["standing"]
 
     def ask(self) -> None:
-        """Tell the holder to stop."""
         try:
             self.holder = self.lock.signal_holder(signal.SIGTERM)
         except (OSError, Refused) as error:  # the lock is a help, not a condition

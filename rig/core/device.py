@@ -65,57 +65,6 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
         raise LimitError("outside the limits, nothing was sent: " + "; ".join(faults))
 
 
-class LineWatch:
-    """The communication timeout of drives that have one: lent, and given back.
-    Journalled before it is changed, so that a later process can put it back."""
-
-    def __init__(self, drives: list[Drive], run: RunFolder) -> None:
-        self._timeouts_s = run.config.comm_timeouts_s
-        self._drives = [d for d in drives if d.axis.name in self._timeouts_s]
-        self._emit = run.emit
-        self._left = timeouts_left(run.journal.records)
-        self._before: dict[str, int] = {}
-
-    def apply(self) -> None:
-        """Set the timeouts; MotionFault where one could not be put back."""
-        for drive in self._drives:
-            name = drive.axis.name
-            try:
-                before = drive.watch()
-            except BusError as error:
-                if not error.refused:
-                    raise
-                raise MotionFault(
-                    f"{name}: its communication timeout cannot be read, so it could "
-                    f"not be restored later: {error}. Correct [comm_timeout] of the "
-                    f"map {drive.axis.map.name}, or leave it out"
-                ) from None
-            counts = drive.watch_counts(self._timeouts_s[name])
-            taken = self._left.get(name)
-            if taken and before == taken["counts"]:  # a killed session's
-                before = taken["before"]
-            lent = {"axis": name, "before": before, "counts": counts}
-            self._emit("comm_timeout", sync=True, **lent)
-            self._before[name] = before
-            drive.set_watch(counts)
-
-    def restore(self, standing: set[str]) -> None:
-        """Give back what was there; never raises. A drive that was not seen to stand
-        keeps its timeout: it stops itself."""
-        for drive in self._drives:
-            name, error = drive.axis.name, "not seen standing"
-            if (counts := self._before.pop(name, None)) is None:
-                continue
-            if name in standing:
-                try:
-                    with drive.line.urgent():
-                        drive.set_watch(counts)
-                    error = ""
-                except Exception as caught:
-                    error = str(caught)
-            self._emit("comm_restored", axis=name, counts=counts, error=error)
-
-
 def timeouts_left(records: list[Record]) -> dict[str, Record]:
     """The ``comm_timeout`` records of a journal that no restoring has followed."""
     left: dict[str, Record] = {}
@@ -144,8 +93,7 @@ class SessionRun(RunFolder):
 
 
 class Device:
-    """Drives and what they are measured with: armed explicitly, not moved once
-    stopped."""
+    """Drives and what they are measured with: armed explicitly, then until stopped."""
 
     def __init__(self, run: SessionRun) -> None:
         self.run, self.emit, self.record = run, run.emit, run.record
@@ -174,7 +122,7 @@ class Device:
         self.heard = 0  # connection of the phone by which the frame holds
         # (n,) commanded at the last posture, and (m,) measured, since the zero.
         self.seen = np.zeros(len(config.axes)), np.zeros(len(config.output_names))
-        self.line_watch = LineWatch(self.drives, run)
+        self._watches: dict[str, int] = {}  # timeouts of the line that were changed
         self.heartbeat = Heartbeat(self.stopper, self.requests, config)
         self.line.check = self._before_exchange
 
@@ -188,7 +136,7 @@ class Device:
         # From here on nothing is to move it before the first move.
         self.rest = tuple(drive.last.position for drive in self.drives if drive.last)
         self.imu.latest()
-        self.line_watch.apply()
+        self._set_watches()
         self.armed = True
         self.heartbeat.start()
 
@@ -212,11 +160,9 @@ class Device:
             fault = "does not enable its power stage. Check its supply, and its enable "
             fault += "and STO inputs"
         elif abs(here - where) > slack:
-            fault = (
-                f"counted {where} pulses when this session found it and {here} now, "
-            )
-            fault += "and nothing moved it: the drive was switched off and on, or "
-            fault += "another controller moves it. Run `jaxcal-rig setup home`"
+            fault = f"counted {where} pulses when this session began and {here} now: "
+            fault += "the drive was switched off and on, or another controller moves "
+            fault += "it. Run `jaxcal-rig setup home`"
         elif not axis.min_pulses - slack <= here <= axis.max_pulses + slack:
             limits = f"{axis.min_pulses}..{axis.max_pulses}"
             fault = f"is at {here} pulses, outside its limits {limits}. Run "
@@ -277,9 +223,8 @@ class Device:
         return reading.value
 
     def await_stream(self) -> Reading:
-        """The newest reading, once it is fresh, while nothing moves: Wi-Fi that saves
-        power pauses, as ``paused_s`` counts. PauseRequested: not within PATIENCE_S.
-        MotionFault: a drive moves."""
+        """The newest reading, once it is fresh, while nothing moves. PauseRequested:
+        past PATIENCE_S. MotionFault: a drive moves."""
         begun = time.monotonic()
         while True:
             try:
@@ -324,6 +269,47 @@ class Device:
         """Nothing more will move: close bus and phone."""
         self.heartbeat.close()
         self.armed = False
-        self.line_watch.restore({r.axis for r in self.stopper.results if r.standing})
+        self._restore_watches({r.axis for r in self.stopper.results if r.standing})
         self.line.close()
         self.imu.close()
+
+    def _set_watches(self) -> None:
+        """Set the drives' watch of the line, journalled first, so that a later process
+        can restore it; MotionFault where that could not be."""
+        killed = timeouts_left(self.run.journal.records)  # of a session that was
+        for drive in self.drives:
+            name = drive.axis.name
+            if (timeout_s := self.config.comm_timeouts_s.get(name)) is None:
+                continue
+            try:
+                before = drive.watch()
+            except BusError as error:
+                if not error.refused:
+                    raise
+                raise MotionFault(
+                    f"{name}: its communication timeout cannot be read, so it could "
+                    f"not be restored later: {error}. Correct [comm_timeout] of the "
+                    f"map {drive.axis.map.name}, or leave it out"
+                ) from None
+            counts, record = drive.watch_counts(timeout_s), killed.get(name)
+            if record and before == record["counts"]:
+                before = record["before"]
+            lent = {"axis": name, "before": before, "counts": counts}
+            self.emit("comm_timeout", sync=True, **lent)
+            self._watches[name] = before
+            drive.set_watch(counts)
+
+    def _restore_watches(self, standing: set[str]) -> None:
+        """Never raises. A drive that was not seen to stand stops itself."""
+        for drive in self.drives:
+            name, error = drive.axis.name, "not seen standing"
+            if (counts := self._watches.pop(name, None)) is None:
+                continue
+            if name in standing:
+                try:
+                    with drive.line.urgent():
+                        drive.set_watch(counts)
+                    error = ""
+                except Exception as caught:
+                    error = str(caught)
+            self.emit("comm_restored", axis=name, counts=counts, error=error)

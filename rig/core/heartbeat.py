@@ -30,7 +30,7 @@ class Stopper:
         self.drives = drives
         self.reason = ""  # of the stop that has latched
         self.results: list[UnitStop] = []
-        self._emit = emit
+        self.emit = emit
         self._lock = threading.RLock()
 
     def stop(self, reason: str, latch: bool = True) -> list[UnitStop]:
@@ -40,7 +40,7 @@ class Stopper:
         with self._lock:
             self.results = stop.stop_all(self.drives)
             units = [dataclasses.asdict(result) for result in self.results]
-            self._emit("stop", reason=reason, units=units)
+            self.emit("stop", reason=reason, units=units)
             return self.results
 
     def stay(self) -> list[UnitStop]:
@@ -49,12 +49,8 @@ class Stopper:
             stand_s = stop.stand_s(self.drives)
             words = stop.stay(self.drives, self.results, stand_s)
             units = [dataclasses.asdict(result) for result in self.results]
-            self._emit("stayed", went_on=words, units=units)
+            self.emit("stayed", went_on=words, units=units)
             return self.results
-
-    def tell(self, text: str) -> None:
-        """Note something that stops nothing."""
-        self._emit("note", text=text)
 
     def check(self) -> None:
         """Raise StopRequested where a stop has latched."""
@@ -100,7 +96,7 @@ class Heartbeat(threading.Thread):
         slept_s, self._ahead = clock_ahead_s() - self._ahead, clock_ahead_s()
         reason, slept = "", f"this computer slept for {slept_s:.0f} s"
         if slept_s > SLEPT_S and not self._moving:
-            self._stopper.tell(slept)
+            self._stopper.emit("note", text=slept)
         elif slept_s > SLEPT_S:
             reason = f"{slept} while the device moved unobserved. Switch its power "
             reason += "saving off"

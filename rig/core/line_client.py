@@ -28,9 +28,12 @@ URGENT_S = 1.0  # for one of a stop, besides an exchange that is under way
 END_S = 2.0  # for the process to end
 GRACE_S = 0.1  # for one whose channels are closed to be gone
 LATE = "does not answer"
-# Errors that the line's process reports and this side raises again, by name.
 # Errors that a line raises of its own accord, by the names that cross the pipe.
-KINDS = {kind.__name__: kind for kind in (LimitError, NotImplementedError, ValueError)}
+KINDS = {kind.__name__: kind for kind in (LimitError, ValueError)}
+OF_MAP = (  # what a drive knows by its map alone
+    "can_reset", "can_home", "can_set_zero", "counts_from_home", "tells_homed",
+    "lasting", "foreign", "watch_counts",
+)  # fmt: skip
 GONE = "Find out who ended it. The session stops its drives"
 
 
@@ -40,9 +43,8 @@ class LineClient(Line):
     def __init__(self, config: RigConfig, emit: Callable[..., Any]) -> None:
         super().__init__(config.bus, config.silence_s, emit)
         # Never opened, unless the process ends.
-        self._own, self.own_drives = make_drives(
-            config.bus, config.axes, config.silence_s
-        )
+        made = make_drives(config.bus, config.axes, config.silence_s)
+        self._own, self.own_drives = made
         self.in_turn = self._own.in_turn
         self._config = config
         self._process: subprocess.Popen[bytes] | None = None
@@ -180,7 +182,6 @@ class LineClient(Line):
         raise raised
 
     def _lose(self, why: str) -> NoReturn:
-        """The process is gone, or is ended here."""
         assert self._process is not None
         late = why == LATE
         if late:  # a stop must not wait for it
@@ -218,11 +219,8 @@ class DriveClient(Drive):
         self.line, self.number, self.axis, self._own = line, number, own.axis, own
         self.last: Status | None = None
         self._origin: int | None = None
-        for name in ("can_reset", "can_home", "can_set_zero", "counts_from_home"):
-            setattr(self, name, getattr(own, name))
-        self.tells_homed = own.tells_homed
-        self.lasting, self.foreign = own.lasting, own.foreign  # type: ignore[method-assign]  # of its map alone
-        self.watch_counts = own.watch_counts  # type: ignore[method-assign]
+        for name in OF_MAP:
+            setattr(self, name, getattr(own, name, None))
 
     def status(self, retries: int | None = None) -> Status:
         values, homed, origin = self.line.ask(self.number, "status", retries)

@@ -72,7 +72,6 @@ class Channel:
 
 
 def told_of_error(error: Exception) -> dict[str, Any]:
-    """An error, for the other end of a channel."""
     names = ("advice", "lost", "refused", "out_of_reach")
     more = {name: getattr(error, name) for name in names if hasattr(error, name)}
     bus = isinstance(error, BusError)

@@ -92,17 +92,15 @@ def _settled(device: Device, deadline: float) -> list[Status]:
         if not (reason := _unquiet(device, device.imu.since(since), now)):
             return statuses
         if now - device.paused_s > deadline:
-            raise MotionFault(
-                f"the device did not settle in {settle.timeout_s:g} s: {reason}"
-            )
+            text = f"the device did not settle in {settle.timeout_s:g} s"
+            raise MotionFault(f"{text}: {reason}")
         time.sleep(device.config.motion.poll_s)
 
 
 def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
     """Why the last readings do not show a device at rest, and what to do."""
     settle = device.config.settle
-    # The last that span the window, as many as wanted: of a slow phone, or one whose
-    # readings come in bursts, they span more.
+    # The last that span the window; of a slow phone, or of bursts, they span more.
     newest = readings[-1].time if readings else now
     before = sum(reading.time <= newest - settle.window_s for reading in readings)
     first = min(before - 1, len(readings) - settle.min_samples)
@@ -153,15 +151,12 @@ def _collect(device: Device, wanted: int) -> list[Reading]:
         if now - polled > config.motion.poll_s:
             polled = now
             if any(status.moving for status in device.statuses()):
-                raise MotionFault(
-                    "a drive moves during the measurement of the posture. Stop the "
-                    "other controller"
-                )
+                text = "a drive moves during the measurement of the posture"
+                raise MotionFault(f"{text}. Stop the other controller")
         time.sleep(0.002)
 
 
 def _check_position(device: Device, target: Pulses, feedback: list[int]) -> None:
-    """The drives still stand on their targets."""
     tolerance = device.config.motion.position_tolerance_deg
     for axis, goal, here in zip(device.config.axes, target, feedback, strict=True):
         if abs(goal - here) > axis.pulses_within(tolerance):
@@ -208,8 +203,7 @@ def _check_agreement(device: Device, commanded: Array, measured: Array) -> None:
 
 
 def _check_predicted(device: Device, commanded: Array, measured: Array) -> None:
-    """What is measured changed about as the device's model says, where it does not say
-    of each axis how far that moved."""
+    """Numbers changed about as the model says, where axes cannot be told apart."""
     if device.predict is None:
         return
     place, first = device.seen

@@ -97,7 +97,6 @@ def _look(device: Device) -> tuple[int, Array]:
 
 
 def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
-    """Start one drive's move."""
     motion, axis = device.config.motion, drive.axis
     tolerance = axis.pulses_within(motion.position_tolerance_deg)
     for tries_left in reversed(range(1 + device.config.bus.read_retries)):
@@ -211,7 +210,6 @@ def _require_on_way(axis: Axis, start: int, goal: int, status: Status) -> None:
 def _stalled(
     axis: Axis, goal: int, status: Status, moved: bool, stood_s: float, stall_s: float
 ) -> MotionFault:
-    """What is wrong with an axis that stands away from its goal."""
     end, angle = map(axis.to_deg, (goal, status.position))
     short_by = abs(end - angle)
     if status.done and not status.moving and moved:
@@ -230,7 +228,6 @@ def _stalled(
 
 
 def _check_speed(device: Device, axis: Axis, seen: list[Status]) -> None:
-    """A drive is no faster than it was told to be."""
     # It was where it was at some time after it was asked and before it answered, so
     # that a slow reply makes no speed; nor do counts by which two readings may differ.
     (first, *_, last), asked = seen, axis.drive_motion[0]

@@ -12,6 +12,7 @@ session with FIRST_DEG of its joint, and grows while the phone turns as `axes` s
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -40,14 +41,10 @@ TOO_FAR = 2.0  # times what checked axes are moved, and MARGIN_DEG: more is a fa
 MARGIN_DEG = 1.0
 SAME = 4 / 3, 0.3  # factor and margin of one axis alone, where `axes` saw its turn
 SEEN_SHARE = 0.1  # of a checked axis's move must be seen, or the moves do not grow
-BLIND = (
-    "No motion was measured. Look for a loose coupling, a stream that does not change, "
-    "or a reduction that is far too small"
-)
-NO_UNIT = (
-    "No angle of the phone exceeds 6.3, so imu.unit (radians or degrees) is not "
-    "proved: turn the base, or the phone's heading, by some degrees"
-)
+BLIND = "Check for a loose coupling, exchanged units, a stream that does not change or "
+BLIND += "a reduction that is far too small"
+NO_UNIT = "No angle of the phone exceeds 6.3, so imu.unit (radians or degrees) is not "
+NO_UNIT += "proved: turn the base, or the phone's heading, by some degrees"
 STEP_DEG = 0.5  # of a derivative of a model
 RADIANS = 180.0 / math.pi
 LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians
@@ -61,10 +58,9 @@ class StopDistance(NamedTuple):
     """The stopping distance of an axis, ``d(v) = v t + k v^2``, in degrees or mm.
 
     A drive obeys ``t`` after its stop was sent and brakes by ``a``, ``k = 1 / (2 a)``;
-    `axes` measures both, by stops at two speeds. Without a stop it brakes by the ramp
-    ``b`` of its move and ends at its target. Stopped at ``u`` it ends beyond that by at
-    most ``u t + u^2 (k - 1 / (2 b))``; the largest of these has to fit between the
-    target and the soft limit.
+    `axes` measures both, at two speeds. Else it brakes by the ramp ``b`` of its move at
+    its target. Stopped at ``u`` it ends beyond that by at most
+    ``u t + u^2 (k - 1 / (2 b))``; the largest has to fit before the soft limit.
     """
 
     delay_s: float
@@ -150,34 +146,31 @@ def slopes(predict: Callable[[Array], Array], at_deg: Array) -> Array:
 def unit_proved(imu: ImuSettings | ReadingsSettings, attitude: Array) -> bool:
     """Whether a phone's (3, 3) attitude can only have come in the configured unit: a
     number over 2 pi is no angle in radians, and degrees read as radians show in the
-    first move, 57.3 times. Numbers have the unit that they are given, quaternions
-    none."""
+    first move, 57.3 times. Numbers have their unit, quaternions none."""
     if isinstance(imu, ReadingsSettings) or imu.by_quaternion or imu.unit == "rad":
         return True
     sent = matrix_to_euler(attitude, str(imu.order))
     return bool(np.abs(sent).max() > LARGEST_RAD)
 
 
+@dataclasses.dataclass
 class Reach:
     """What one axis may be sent, in pulses, by the moves so far."""
 
-    def __init__(
-        self,
-        axis: Axis,
-        factor: float = 1.0,  # RADIANS where the phone's unit is not proved
-        checked: bool = False,
-        gain: float | None = None,  # degrees of the phone for one, as `axes` saw
-        scale: float = 1.0,  # of a degree, in the unit of the readings
-    ) -> None:
-        self.axis, self.factor, self.checked = axis, factor, checked
-        self.gain, self.scale = gain, scale
-        self.seen = checked  # the phone has turned, in a unit that is proved
-        # Pulses of the longest move so far; degrees per pulse that the phone turned at
-        # most in that move.
-        self.longest = self.deg_per_pulse = 0.0
-        if checked:
-            self.deg_per_pulse = (gain or 1.0) / abs(axis.pulses_per_deg)
-            self.longest = FIRST_DEG * abs(axis.pulses_per_deg) / GROWTH
+    axis: Axis
+    factor: float = 1.0  # RADIANS where the phone's unit is not proved
+    checked: bool = False
+    gain: float | None = None  # degrees of the phone for one, as `axes` saw
+    scale: float = 1.0  # of a degree, in the unit of the readings
+    longest: float = 0.0  # pulses, of the moves so far
+    deg_per_pulse: float = 0.0  # that the phone turned at most in that move
+    seen: bool = False  # the phone has turned, in a unit that is proved
+
+    def __post_init__(self) -> None:
+        if self.checked:
+            per_deg, self.seen = abs(self.axis.pulses_per_deg), True
+            self.deg_per_pulse = (self.gain or 1.0) / per_deg
+            self.longest = FIRST_DEG * per_deg / GROWTH
 
     def pulses(self, wanted: float, most_deg: float = math.inf) -> int:
         """Pulses, at least 1, of the next of evenly growing moves to a wanted count."""
@@ -209,8 +202,7 @@ class Reach:
         self.deg_per_pulse = most / self.longest
 
     def unseen(self, begun: int, here: int, goal: int) -> int:
-        """Pulses towards a goal that may be gone without the phone's word; MotionFault
-        where so many were gone already."""
+        """Pulses that may be gone without the phone's word; MotionFault: they were."""
         axis = self.axis
         most = max(1, int(axis.motor_pulses(UNSEEN_MOTOR_DEG)))
         gone = abs(here - begun)

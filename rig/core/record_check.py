@@ -53,7 +53,6 @@ def check_drives(
 
 
 def _exchanged(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
-    """What of a drive's identity differs from the record's."""
     evidence = record.state(IDENTIFIED) or {}
     known = evidence.get("identity", {}).get(drive.axis.name, {})
     found = drive.ids() if known else {}
@@ -149,8 +148,7 @@ def moved(config: RigConfig, then: Array, now: Array) -> tuple[float, Array]:
 
 def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
     """The zero posture stands as it stood: what was compared, in words. MotionFault:
-    (3, 3) ``then`` and ``now`` differ by more than
-    ``session.reference_tolerance_deg``."""
+    (3, 3) attitudes differ by more than ``session.reference_tolerance_deg``."""
     limit = config.session.reference_tolerance_deg
     angle, joints = moved(config, then, now)
     blind, unit = geometry_of(config).unseen(then), config.output_unit

@@ -23,7 +23,7 @@ from rig.core.record_check import ZeroRecord
 from rig.faults import MotionFault, NotFollowing, TurnedTooFar, Unreachable, ending
 from rig.journal.device import SIGN_CHECKED, ZEROED
 from rig.journal.lock import BusLock
-from rig.journal.run_folder import Record, RunFolder
+from rig.journal.run_folder import Record
 from rig.readings.attitude import Array, angle_between_deg
 from rig.readings.geometry import Attitudes
 
@@ -214,7 +214,12 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
             _reorient(device)
             measurement = measure(move(device, posture))
     except NotFollowing:
-        _withdraw(run)
+        # A coupling slips, perhaps by a little before it was seen: what was measured
+        # since the zero posture was read last is measured again.
+        looked = [*run.journal.events("zero"), *run.journal.events("reference")]
+        since = max((record["seq"] for record in looked), default=0)
+        if names := [n for n, r in run.postures().items() if r["seq"] > since]:
+            run.emit("void", sync=True, names=names)
         raise
     except Unreachable as reason:
         _leave_out(device, name, str(reason))
@@ -223,16 +228,6 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
     record = device.emit("posture", sync=True, name=name, **measurement, **fields)
     device.requests.check_pause()
     return record
-
-
-def _withdraw(run: RunFolder) -> None:
-    """A coupling slips, perhaps by a little before it was seen: what was measured
-    since the zero posture was read last is measured again."""
-    looked = [*run.journal.events("zero"), *run.journal.events("reference")]
-    since = max((record["seq"] for record in looked), default=0)
-    names = [n for n, record in run.postures().items() if record["seq"] > since]
-    if names:
-        run.emit("void", sync=True, names=names)
 
 
 def _leave_out(device: Device, name: str, reason: str) -> None:
@@ -247,7 +242,6 @@ def _leave_out(device: Device, name: str, reason: str) -> None:
 
 
 def _check_lost(device: Device) -> None:
-    """No more postures are out of reach than may be."""
     most = device.config.session.max_unreachable
     lost = {record["name"] for record in device.run.journal.events("unreachable")}
     if len(lost) > most:
@@ -297,8 +291,7 @@ def show(device: Device) -> None:
 
 
 def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> None:
-    """(3,) turns for a degree of axis j, or (m,) of numbers, now and at `axes`; the
-    noise of each part."""
+    """Turns for a degree of axis j (3,), or of numbers (m,), with those at `axes`."""
     size, before = float(np.linalg.norm(turn)), float(np.linalg.norm(then))
     share, axis, geometry = size / before, device.config.axes[j], device.geometry
     one = "degree" if axis.unit_name == "deg" else axis.unit_name
@@ -317,15 +310,11 @@ def _compare(device: Device, j: int, turn: Array, then: Array, noise: float) -> 
             "exchanged, or the coupling slips"
         )
     elif aside > ASIDE_DEG + np.degrees(SURE_SIGMA * noise / before):
-        fault = (
-            f"{axis.name} turned the phone about an axis {aside:.1f} deg from the one "
-            "that `axes` measured: the phone or its holder was turned since"
-        )
+        did, what = "turned the phone about an axis", "phone or its holder was turned"
         if device.config.imu is None:
-            fault = (
-                f"{axis.name} changed the readings in a direction {aside:.1f} deg from "
-                "the one that `axes` measured: the sensor was moved since"
-            )
+            did, what = "changed the readings in a direction", "sensor was moved"
+        fault = f"{axis.name} {did} {aside:.1f} deg from the one that `axes` measured: "
+        fault += f"the {what} since"
     if fault:
         device.record.void(SIGN_CHECKED, fault)
         raise MotionFault(f"{fault}. Correct it, then run `jaxcal-rig setup axes`")

@@ -52,7 +52,8 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
     line, pairs = drives[0].line, list(zip(drives, results, strict=True))
     with line.urgent():
         with line.urgent(line.quick_s):
-            broadcast(drives)
+            with contextlib.suppress(Exception):  # an extra: each gets its own as well
+                line.stop_at_once(drives)
             _send(pairs)
         for _ in range(ROUNDS - 1):
             _send(pairs)
@@ -62,12 +63,6 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
 
 def _responsive_first(pairs: Pairs) -> Pairs:
     return sorted(pairs, key=lambda pair: pair[0].axis.unit in pair[0].line.silent)
-
-
-def broadcast(drives: list[Drive]) -> None:
-    """Stop all by one frame, where they take it."""
-    with contextlib.suppress(Exception):  # an extra: each gets its own as well
-        drives[0].line.stop_at_once(drives)
 
 
 def _send(pairs: Pairs) -> None:
@@ -113,8 +108,7 @@ def _verify(pairs: Pairs) -> None:
 
 def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[str]:
     """What goes on by itself after a stop, in words; it is stopped, as ``results`` say.
-    Where the map can, what drives stand at becomes their target first. A drive without
-    power may sink; that is no restart."""
+    Where the map can, its place becomes its target. To sink unpowered is no restart."""
     pairs = list(zip(drives, results, strict=True))
     words: list[str] = []
     for _ in range(ROUNDS):
@@ -134,8 +128,7 @@ def stay(drives: list[Drive], results: list[UnitStop], seconds: float) -> list[s
 
 
 def _restarted(pairs: Pairs, end: float) -> tuple[list[UnitStop], list[UnitStop]]:
-    """Drives that stood and move again before a time; and, where none does, those that
-    were seen to stand at its end."""
+    """Drives that stood and move again; else those seen to stand until the end."""
     stood: list[UnitStop] = []
     while time.monotonic() < end:
         time.sleep(LOOK_S)

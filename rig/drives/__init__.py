@@ -22,8 +22,7 @@ KINDS = {"modbus": "rig.drives.modbus:ModbusDrive"}
 
 
 def named(text: str, folder: pathlib.Path) -> Any:
-    """What ``MODULE:NAME`` names, or ``FILE.py:NAME`` of a folder; raises whatever the
-    import of foreign code raises."""
+    """What ``MODULE:NAME``, or ``FILE.py:NAME`` of a folder, names; raises anything."""
     place, _, name = text.rpartition(":")
     if not place.endswith(".py"):
         return getattr(importlib.import_module(place), name)

@@ -11,7 +11,7 @@ import contextlib
 import os
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rig.drives.drive import Drive
@@ -39,8 +39,6 @@ NOBODY = 250  # a number that no unit has
 
 
 class Rejected(BusError):
-    """The drive answered with an exception."""
-
     def __init__(self, unit: int, code: int, address: int) -> None:
         self.code = code
         self.refused = code not in PASSING
@@ -57,28 +55,21 @@ class Bus(Line):
 
     transports = ("tcp", "rtu_tcp", "rtu")
 
-    def __init__(
-        self,
-        settings: BusSettings,
-        silence_s: float = 0.0,
-        emit: Callable[..., Any] = lambda event, **fields: None,
-    ) -> None:
-        # On Modbus TCP the gateway keeps the line's silence.
-        super().__init__(
-            settings, (settings.transport != "tcp" and silence_s) or 0.0, emit
-        )
+    def __init__(self, settings: BusSettings, *silence_emit: Any, **named: Any) -> None:
+        super().__init__(settings, *silence_emit, **named)
+        if settings.transport == "tcp":  # the gateway keeps the line's silence
+            self.silence_s = 0.0
         self._quiet_until = 0.0
         # Of a unit: function and bytes of each reply that may still come, and when it
         # was asked; and a function and an address that were read well.
         self._owed: dict[int, list[tuple[int, int, float]]] = {}
         self._readable: dict[int, tuple[int, int]] = {}
         self.listen_s = LISTEN_S
-        self._client: Wire | None = None
+        self._client = Wire(settings)
         self._spare: Wire | None = None  # a second connection, of a stop
         self._doubted: set[int] = set()  # whose acknowledgement may be an echo
 
     def connect(self) -> None:
-        self._client = self._client or Wire(self.settings)
         try:
             self._client.open()
         except ModuleNotFoundError as error:
@@ -91,20 +82,19 @@ class Bus(Line):
 
     def close(self) -> None:
         with self._lock:
-            for wire in (self._client, self._spare):
-                if wire is not None:
-                    wire.close()
-            self._client = self._spare = None
+            for wire in filter(None, (self._client, self._spare)):
+                wire.close()
+            self._client, self._spare = Wire(self.settings), None
 
     @property
     def echoes(self) -> bool:
         """Whether the adapter was seen to send back what it is sent."""
-        return self._client is not None and bool(self._client.echo)
+        return bool(self._client.echo)
 
     @property
     def late(self) -> set[int]:
         """Units whose replies came after their time."""
-        return self._client.late if self._client else set()
+        return self._client.late
 
     def answers_for_every_unit(self) -> bool:
         """Whether the server also answers for a unit number that no device has."""
@@ -122,7 +112,7 @@ class Bus(Line):
     @property
     def noise(self) -> str:
         """What came last that was no reply, in hex."""
-        return "" if self._client is None else self._client.noise
+        return self._client.noise
 
     def doubts(self, unit: int) -> bool:
         """Whether its last acknowledgement may have been the request, sent back."""
@@ -161,7 +151,7 @@ class Bus(Line):
         valid reply after all tries; Rejected: an exception, every time.
         """
         tries = self.read_tries if retries is None else 1 + retries
-        size, what = data_size(function, quantity), "registers"
+        size = data_size(function, quantity)
         for tries_left in reversed(range(tries)):
             try:
                 self._catch_up(unit, (function, address))
@@ -187,7 +177,7 @@ class Bus(Line):
         time to wait, whether its reply is only late."""
         if self._urgent or unit in self._readable or error.refused or error.lost:
             return
-        if unit not in self.silent or unit == NOBODY or self._client is None:
+        if unit not in self.silent or unit == NOBODY:
             return
         with self._lock, contextlib.suppress(OSError, BusError):
             if self._client.listen(unit, self.listen_s):
@@ -206,7 +196,7 @@ class Bus(Line):
         if function == 16:
             head += struct.pack(">H", len(words))
             data = bytes([len(data)]) + data
-        unsure = function != 16 and (self._client is None or self._client.echo is None)
+        unsure = function != 16 and self._client.echo is None
         reply = self._exchange(function, unit, head + data, address, owed=0)
         (self._doubted.add if unsure else self._doubted.discard)(unit)
         if reply != (head if function == 16 else head + data):
@@ -214,7 +204,6 @@ class Bus(Line):
             raise BusError(f"unit {unit}: the reply to a write is not its echo")
 
     def _read(self, unit: int, function: int, address: int, quantity: int) -> bytes:
-        """The data of one reply, of any length."""
         request = struct.pack(">HH", address, quantity)
         size = data_size(function, quantity)
         reply = self._exchange(function, unit, request, address, owed=size)
@@ -307,7 +296,6 @@ class Bus(Line):
         if (silent_s := self._quiet_until - time.monotonic()) > 0.0:
             time.sleep(silent_s)  # sleep(0) takes .1 ms as well
         self.open()  # connecting, where it is lost, may take as long as configured
-        assert self._client is not None
         if self._urgent and self._spare is None and self._client.owes:
             self._add_connection()
         pdu = bytes([function]) + data
@@ -331,10 +319,10 @@ class Bus(Line):
     def _resynchronise(self, unit: int, function: int, owed: int) -> None:
         """Empty an RTU line; a reply of ``owed`` bytes may still come."""
         with self._lock:
-            if self._client is None or self.settings.transport == "tcp":
+            if self.settings.transport == "tcp":
                 return
-            owing = self._owed.setdefault(unit, [])
-            owing.append((function, owed, time.monotonic()))
+            owing = (function, owed, time.monotonic())
+            self._owed.setdefault(unit, []).append(owing)
             gap = max(0.02, 20 * 11.0 / self.settings.baudrate, self.silence_s)
             end = time.monotonic() + 2 * self._timeout_s
             try:
@@ -347,7 +335,6 @@ class Bus(Line):
 
 
 def _why_closed(settings: BusSettings, error: Exception) -> tuple[str, str]:
-    """The reason, and what to do."""
     if settings.transport != "rtu":
         why = "nothing answers there, or all its connections are in use"
         return why, "Check power, cable and address"
@@ -361,7 +348,6 @@ def _why_closed(settings: BusSettings, error: Exception) -> tuple[str, str]:
 
 
 def data_size(function: int, quantity: int) -> int:
-    """Bytes of so many registers, or bits."""
     return 2 * quantity if function in REGISTERS else (quantity + 7) // 8
 
 

@@ -11,7 +11,7 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from rig.drives.line import BusError, Line
 from rig.faults import LimitError, MotionFault
@@ -26,9 +26,8 @@ LOOKS = 4  # for two readings that agree
 HOME = 2**30  # a count that no drive shows when it is switched on
 
 
-class Look(NamedTuple):
-    """What a drive says when it is looked at."""
-
+@dataclasses.dataclass(frozen=True)
+class Look:
     position: int  # counts
     enabled: bool
     done: bool  # its last move has ended
@@ -38,22 +37,14 @@ class Look(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Status:
-    """What a drive says about itself."""
+class Status(Look):
+    """What it said, its position in pulses, and when."""
 
-    word: int | None
-    position: int  # pulses
-    asked: float  # monotonic seconds before it was asked, ...
-    time: float  # ... and once it had answered
-    enabled: bool
-    done: bool
-    moving: bool
-    fault: bool
+    asked: float = 0.0  # monotonic seconds before it was asked, ...
+    time: float = 0.0  # ... and once it had answered
 
 
 class Drive(abc.ABC):
-    """One axis's drive on its line."""
-
     line_type: ClassVar[type[Line]]
     can_reset = can_home = can_set_zero = False
     counts_from_home = False  # its origin is told from its count: HOME or 0
@@ -140,17 +131,10 @@ class Drive(abc.ABC):
         """Pulses for one motor turn by the drive's own word; None where it has none."""
         return None
 
-    def watch(self) -> int:
-        """The line's timeout as the drive's register holds it, where it has one."""
-        raise NotImplementedError("its map has no comm_timeout")  # else overridden
-
-    def set_watch(self, counts: int) -> None:
-        """Set the register of the timeout of the line."""
-        raise NotImplementedError("its map has no comm_timeout")  # else overridden
-
-    def watch_counts(self, seconds: float) -> int:
-        """The timeout's register for so many seconds, or for a little more."""
-        raise NotImplementedError("its map has no comm_timeout")  # else overridden
+    # Of maps with comm_timeout alone: the register of the line's timeout,
+    watch: Callable[[], int]
+    set_watch: Callable[[int], None]
+    watch_counts: Callable[[float], int]  # for so many seconds, or a little more
 
     def lasting(self, ids: dict[str, int | str]) -> dict[str, int | str]:
         """The ids of a drive that do not change."""
@@ -183,10 +167,8 @@ class Drive(abc.ABC):
         look = self.look(retries)
         if self._origin is None:
             self._origin = HOME if look.position > HOME // 2 else 0
-        self.last = Status(
-            look.word, look.position - self._origin, asked, time.monotonic(),
-            look.enabled, look.done, look.moving, look.fault,
-        )  # fmt: skip
+        said = vars(look) | {"position": look.position - self._origin}
+        self.last = Status(**said, asked=asked, time=time.monotonic())
         return self.last
 
     def steady(self, retries: int | None = None) -> Status:
@@ -209,10 +191,10 @@ class Drive(abc.ABC):
             text = ""
             with contextlib.suppress(BusError):  # the bit alone is reason enough
                 text = self.alarm()
-            text = text or "fault bit set"
             raise MotionFault(
-                f"{self.axis.name}: {text}. The drive has stopped itself. Find the "
-                "cause in its manual, then continue with --reset-alarms"
+                f"{self.axis.name}: {text or 'fault bit set'}. The drive has stopped "
+                "itself. Find the cause in its manual, then continue with "
+                "--reset-alarms"
             )
         if not status.enabled:
             raise MotionFault(

@@ -6,18 +6,11 @@ import contextlib
 import math
 from typing import TYPE_CHECKING, Any
 
+from rig import registers
 from rig.drives.bus import Bus, Rejected, words_of
 from rig.drives.drive import Drive, Look
 from rig.drives.line import BusError
-from rig.registers import (
-    HIGHEST,
-    LOWEST,
-    REGISTERS,
-    Frames,
-    Value,
-    decode,
-    motion_counts,
-)
+from rig.registers import REGISTERS, Frames, Value
 
 if TYPE_CHECKING:
     from rig.config.axis import Axis
@@ -26,8 +19,6 @@ if TYPE_CHECKING:
 
 
 class ModbusDrive(Drive):
-    """What a register map means, spoken over the bus."""
-
     line_type = Bus
     axis: Axis
     line: Bus
@@ -41,7 +32,6 @@ class ModbusDrive(Drive):
 
     @property
     def map(self) -> RegisterMap:
-        """The registers of its family."""
         found: Any = self.axis.map  # or what a stop could read of one
         return found
 
@@ -89,7 +79,6 @@ class ModbusDrive(Drive):
         return flags["done"] and not flags["moving"]
 
     def alarm(self) -> str:
-        """The alarm in words, empty where there is none or no register for it."""
         if not (read := self.map.alarm) or not (code := self.read(read)):
             return ""
         name = read.names.get(code)
@@ -99,11 +88,10 @@ class ModbusDrive(Drive):
         """Every frame is sent exactly once; speed and ramps as registers hold them."""
         place = count / self.map.position.counts
         per_rev = self.axis.pulses_per_rev
-        counts = motion_counts(self.map.units, per_rev, speed, accel)
+        counts = registers.motion_counts(self.map.units, per_rev, speed, accel)
         self.write(self.map.move, position=place, **counts)
 
     def stop(self) -> None:
-        """Quick stop; torque stays on."""
         self.write(self.map.stop)
 
     def reset(self) -> None:
@@ -114,7 +102,6 @@ class ModbusDrive(Drive):
         self.write(self.map.hold, position=(pulses + self.origin) / counts)
 
     def held(self) -> int | None:
-        """The target register as it reads, None where it cannot be read."""
         read = self.map.target
         with contextlib.suppress(Rejected):
             return self.read(read) if read else None
@@ -127,9 +114,8 @@ class ModbusDrive(Drive):
         self.write(self.map.set_zero, home=count)
 
     def mirror_limits(self) -> None:
-        """Write the axis's soft limits into the drive, as far as it can count."""
         low, high = (
-            min(max(pulses + self.origin, LOWEST), HIGHEST)
+            min(max(pulses + self.origin, registers.LOWEST), registers.HIGHEST)
             for pulses in (self.axis.min_pulses, self.axis.max_pulses)
         )
         self.write(self.map.limits, min=low, max=high)
@@ -189,8 +175,7 @@ def decoded(
     word_order: str,
     retries: int | None = None,
 ) -> float:
-    """The value of registers, or bits, of a unit."""
     data = bus.read(unit, read.function, read.address, read.quantity, retries)
     if read.function not in REGISTERS:
         return int.from_bytes(data, "little") & (1 << read.quantity) - 1
-    return decode(words_of(data), read.type, word_order)
+    return registers.decode(words_of(data), read.type, word_order)

@@ -182,7 +182,6 @@ class Wire:
     def _why(
         self, came: bytes, timeout_s: float, late: bool = False, begun: bytes = b"\0"
     ) -> str:
-        """Why there is no reply, by all that came."""
         if late:
             return f"late by over {timeout_s:g} s, like others: raise bus.timeout_s"
         if not came:
@@ -251,8 +250,7 @@ class Wire:
         return reply
 
     def _read(self, seconds: float) -> bytes:
-        """What comes within a time; OSError where the peer has closed the connection,
-        or the port is gone."""
+        """What comes within a time; OSError where connection or port is gone."""
         if not select.select([self.socket], [], [], seconds)[0]:
             return b""
         if not self._is_socket:

@@ -32,26 +32,19 @@ CLEAR = 4.0  # standard deviations that make a difference a finding
 NEAREST = 0.7  # cosine: an axis within 45 degrees of where it is expected
 EXCHANGED = 0.3  # of the sum of cosines: exchanged drives must explain more by it
 LETTERS = ("X", "Y", "Z")
-# A smaller turn of the phone cannot be told from cross-coupling of the axes, and the
-# linear calibration takes it up as such.
-MOUNTING_DEG = 3.0
-# Measured against commanded: what A may take up, and what only a wrong gearing does.
-SOUND_RATIO = (0.4, 1.5)
-# Measured against commanded, once radians and degrees are exchanged.
-NEAR_UNIT = (0.3, 2.0)
+MOUNTING_DEG = 3.0  # a smaller turn is like cross-coupling, and A takes it up
+SOUND_RATIO = (0.4, 1.5)  # measured against commanded: what A may take up
+NEAR_UNIT = (0.3, 2.0)  # the same, once radians and degrees are exchanged
 UNPROVED_FACTOR = 2.0  # by which a gearing is corrected on the phone's word alone
-BY_PLATE = (
-    "Nothing was corrected. Set pulses_per_rev and reduction according to the drives "
-    "and the gearboxes' name plates, then run `jaxcal-rig setup axes` again"
-)
+AGAIN = "then run `jaxcal-rig setup axes` again"
+BY_PLATE = "Nothing was corrected. Set pulses_per_rev and reduction according to the "
+BY_PLATE += f"drives and the gearboxes' name plates, {AGAIN}"
 DIGITS = 4  # of a reduction that was measured
 OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
 
 
 @dataclasses.dataclass(frozen=True)
 class Stand:
-    """The device measured at one place."""
-
     pulses: Array  # (n,)
     attitude: Array  # (3, 3) phone to its world
     std_deg: float  # of one reading
@@ -145,41 +138,33 @@ def check_numbers(
     """Corrections of directions, and what numbers change for a unit of each axis.
 
     A number of an axis's name rises with it and, in its unit, about as far; or numbers
-    change as a model says, ``expected`` (m, n) for a unit of each. MotionFault: by far
-    more, or less.
+    change as a model says, ``expected`` (m, n) for a unit of each; else MotionFault.
     """
-    rates, changes, low, high = rates_of(config, stands), [], *SOUND_RATIO
+    rates, changes, (low, high) = rates_of(config, stands), [], SOUND_RATIO
     ratios = []
     for j, axis in enumerate(config.axes):
-        per_unit = rates[:, j] * axis.pulses_per_deg
+        per_unit, reason = rates[:, j] * axis.pulses_per_deg, ""
         ratios.append(float(np.linalg.norm(per_unit)))
         if expected is not None:
-            changes += _against(config, axis, per_unit, expected[:, j])
-            continue
-        if axis.name not in config.output_names:
-            continue
-        rate = per_unit[config.output_names.index(axis.name)]
-        same = config.output_unit == axis.unit_name
-        if same and not low <= abs(rate) <= high:
-            raise MotionFault(
-                f"{axis.name} moves {abs(rate):.3g} {axis.unit_name} per commanded "
-                f"{axis.unit_name}; allowed is {low:g} to {high:g}. {BY_PLATE}"
-            )
-        if rate < 0:
-            reason = f"the reading {axis.name} falls when the axis is commanded up"
-            changes.append(_turned(axis, reason))
+            reason = _against(axis, per_unit, expected[:, j])
+        elif axis.name in config.output_names:
+            rate = per_unit[config.output_names.index(axis.name)]
+            same = config.output_unit == axis.unit_name
+            if same and not low <= abs(rate) <= high:
+                raise MotionFault(
+                    f"{axis.name} moves {abs(rate):.3g} {axis.unit_name} per commanded "
+                    f"{axis.unit_name}; allowed is {low:g} to {high:g}. {BY_PLATE}"
+                )
+            if rate < 0:
+                reason = f"the reading {axis.name} falls when the axis is commanded up"
+        if reason:
+            key = f"axes.{axis.name}.direction"
+            changes.append(Change(key, axis.direction, -axis.direction, reason))
     return changes, ratios
 
 
-def _turned(axis: Axis, reason: str) -> Change:
-    key = f"axes.{axis.name}.direction"
-    return Change(key, axis.direction, -axis.direction, reason)
-
-
-def _against(
-    config: RigConfig, axis: Axis, seen: Array, expected: Array
-) -> list[Change]:
-    """An axis changed the readings as the model says, the other way, or neither."""
+def _against(axis: Axis, seen: Array, expected: Array) -> str:
+    """Why an axis is to be turned round, by what the model says; or MotionFault."""
     size, way = float(np.linalg.norm(seen)), float(np.linalg.norm(expected))
     cosine = float(seen @ expected) / max(size * way, 1e-12)
     low, high = SOUND_RATIO
@@ -195,7 +180,7 @@ def _against(
             "exchanged, or [model] is of another device. Nothing was corrected"
         )
     reason = "the readings change in the opposite direction to the model"
-    return [] if cosine > 0 else [_turned(axis, reason)]
+    return "" if cosine > 0 else reason
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,42 +202,35 @@ def find(
     ``expected``: (3, n) axes of an arm's joints in its tip's frame at the start.
     MotionFault: the axes fit no joints, or the readings are no rotations.
     """
-    rates = rates_of(config, stands)
-    size = np.linalg.norm(rates, axis=0)
-    axes = rates / size
-    told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
-    of_arm = expected is not None  # whose joints have no letters
-    if expected is None:
-        expected = np.eye(3)[:, [LETTERS.index(letter) for letter in config.letters]]
-    joints, signs, mounting = _placed(config, axes, expected)
-    turned, order = float(np.linalg.norm(turn(told, mounting))), None
-    if of_arm:  # the order of its joints is known
-        return Findings(joints, signs * size, mounting, turned, order)
-    inner = _inner(config, stands, rates)
+    rates, letters = rates_of(config, stands), config.letters
+    if expected is not None:  # the order of an arm's joints, without letters, is known
+        return _placed(config, rates, expected)
+    expected = np.eye(3)[:, [LETTERS.index(letter) for letter in letters]]
+    findings, inner = _placed(config, rates, expected), _inner(config, stands, rates)
+    if inner:
+        outwards = np.argsort(inner)[::-1]
+        order = "".join(letters[findings.joints[i]] for i in outwards)
+        return dataclasses.replace(findings, order=order)
     if inner is not None:
-        if not inner:
-            raise MotionFault(
-                "the phone's readings do not combine like rotations of joints: "
-                "imu.order, imu.columns or imu.signs is wrong, or the phone is loose. "
-                "Nothing was corrected"
-            )
-        order = "".join(config.letters[joints[i]] for i in np.argsort(inner)[::-1])
-    as_told = axes * [axis.direction for axis in config.axes]
+        raise MotionFault(
+            "the phone's readings do not combine like rotations of joints: imu.order, "
+            "imu.columns or imu.signs is wrong, or the phone is loose. Nothing was "
+            "corrected"
+        )
+    as_told = rates * [axis.direction for axis in config.axes]
     # Of fewer axes nothing is a mirror.
-    mirrored = rates.shape[1] == 3 and np.linalg.det(as_told @ expected) < 0
-    if mirrored and order is None:
+    if rates.shape[1] == 3 and np.linalg.det(as_told @ expected) < 0:
         raise MotionFault(
             "the axes are mirrored, and the phone is too noisy to show whether a "
-            "direction or imu.signs is wrong. Raise settle.samples, then run "
-            "`jaxcal-rig setup axes` again"
+            f"direction or imu.signs is wrong. Raise settle.samples, {AGAIN}"
         )
-    return Findings(joints, signs * size, mounting, turned, order)
+    return findings
 
 
-def _placed(
-    config: RigConfig, axes: Array, expected: Array
-) -> tuple[tuple[int, ...], Array, Array]:
-    """Joint and sign of each drive, and the mounting that fits them best."""
+def _placed(config: RigConfig, rates: Array, expected: Array) -> Findings:
+    """What each drive turns, and the mounting that fits them best."""
+    size = np.linalg.norm(rates, axis=0)
+    axes = rates / size
     told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
     cosines = expected.T @ told @ axes  # rows: joints
     joints: tuple[int, ...] = max(
@@ -268,8 +246,7 @@ def _placed(
         unit = config.axes[int(np.abs(cosine).argmin())].unit
         raise MotionFault(
             f"unit {unit} turns the phone about an axis more than 45 deg from every "
-            "joint's axis, so imu.mounting_deg is wrong. Correct it roughly, then run "
-            "`jaxcal-rig setup axes` again"
+            f"joint's axis, so imu.mounting_deg is wrong. Correct it roughly, {AGAIN}"
         )
     goal, turned = expected[:, joints] * signs, told @ axes
     if len(joints) == 1:  # the least turn that fits it
@@ -279,7 +256,9 @@ def _placed(
         correction = Rotation.from_rotvec(across * (angle / max(sine, 1e-12)))
     else:
         correction, _ = Rotation.align_vectors(goal.T, turned.T)
-    return joints, signs, correction.as_matrix() @ told
+    mounting = correction.as_matrix() @ told
+    turned_deg = float(np.linalg.norm(turn(told, mounting)))
+    return Findings(joints, signs * size, mounting, turned_deg, None)
 
 
 # What follows for rig.toml
@@ -302,8 +281,8 @@ class Change:
 
 def ratios_of(config: RigConfig, findings: Findings) -> list[float]:
     """What each drive turned the phone, as a share of what it was commanded."""
-    pairs = zip(findings.deg_per_pulse, config.axes, strict=True)
-    return [float(abs(each * axis.pulses_per_deg)) for each, axis in pairs]
+    scales = [axis.pulses_per_deg for axis in config.axes]
+    return [float(ratio) for ratio in np.abs(findings.deg_per_pulse * scales)]
 
 
 def require_unit(
@@ -312,9 +291,8 @@ def require_unit(
     """MotionFault where the phone's unit is not the configured one, or not clear.
 
     Two gearings of the file that agree with the phone prove it (of a single axis the
-    one): both would have to be wrong by 57.3. ``ratios`` are measured against
-    commanded, by the drives' own registers where they have one; ``proved``: not all
-    turn as if it were the other.
+    one): both would have to be wrong by 57.3. ``ratios``: measured against commanded by
+    the drives' own registers; ``proved``: not all turn as if it were the other.
     """
     unit = config.phone.unit
     other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
@@ -322,8 +300,7 @@ def require_unit(
     if all(low <= ratio * factor <= high for ratio in ratios):
         raise MotionFault(
             f'{shown}, about {1 / factor:.3g}: rig.toml has imu.unit = "{unit}", but '
-            f'the phone sends {other}. Set imu.unit = "{other}", then run `jaxcal-rig '
-            "axes` again"
+            f'the phone sends {other}. Set imu.unit = "{other}", {AGAIN}'
         )
     low, high = SOUND_RATIO
     sound = sum(low <= ratio <= high for ratio in ratios)
@@ -417,11 +394,7 @@ def lines(config: RigConfig, findings: Findings) -> list[str]:
             f"  {unit:>4}  {axis.name:<6}  {_way(findings.deg_per_pulse[drive]):<8}  "
             f"{ratios[drive]:18.3f}"
         )
-    angles = matrix_to_euler(findings.mounting, "ZYX")
-    text.append(
-        f"  phone: turned by [{' '.join(f'{angle:.1f}' for angle in angles)}] deg "
-        f"about Z, Y, X, {findings.turned_deg:.1f} from imu.mounting_deg"
-    )
+    text.append(f"  phone: turned {findings.turned_deg:.1f} deg from imu.mounting_deg")
     if config.is_arm:
         text.append("  parallel joints look alike: watch that the right one moves")
     else:

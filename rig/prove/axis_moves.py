@@ -8,33 +8,18 @@ from rig.command_run import Run
 from rig.config.axis import Axis
 from rig.core.device import Device, Posture
 from rig.core.motion import move
-from rig.core.proof import FIRST_MOTOR_DEG, slopes, unit_proved
+from rig.core.proof import BLIND, FIRST_MOTOR_DEG, slopes, unit_proved
 from rig.faults import MotionFault, Refused
 from rig.journal.device import SIGN_CHECKED
-from rig.prove.axis_check import (
-    CLEAR,
-    Change,
-    Stand,
-    check_numbers,
-    corner_name,
-    corners_of,
-    find,
-    lines,
-    proposals,
-    rates_of,
-    ratios_of,
-    require_gearing,
-    require_unit,
-    stand_at,
-)
+from rig.prove import axis_check
+from rig.prove.axis_check import Change, Stand
 from rig.prove.stops import prove_stops
 
 REACH_DEG = 3.0  # each way
 FAR_ENOUGH = 1.1  # a move that would be no longer than that is not made
 SURE_SIGMA = 3.0
 CORNER_DEG = 6.0  # commanded at most, so that the phone turns about REACH_DEG
-# Of the mean over the corners: two rotations of REACH_DEG make 0.08 deg there.
-CORNER_STD_DEG = 0.015
+CORNER_STD_DEG = 0.015  # of the mean over corners, where rotations make 0.08 deg
 ROOM_DEG = 0.2  # left to a limit
 SEEN_DEG = 0.03  # the phone must turn at least this much in a whole move
 SEEN_SIGMA = 6.0
@@ -49,18 +34,18 @@ def check_axes(run: Run, device: Device) -> list[Change]:
     if config.imu is None:
         if model is not None:
             expected = slopes(model.predict, config.to_deg(start))
-        changes, ratios = check_numbers(config, stands, expected)
+        changes, ratios = axis_check.check_numbers(config, stands, expected)
     else:
         if model is not None and model.rotations is not None:
             expected = model.axes_at(config.to_deg(start))
-        findings = find(config, stands, expected)
+        findings = axis_check.find(config, stands, expected)
         told = [drive.pulses_per_rev() for drive in device.drives]
-        ratios = ratios_of(config, findings)
+        ratios = axis_check.ratios_of(config, findings)
         if config.phone.unit == "rad":
-            require_unit(config, ratios, proved=True)
-        require_gearing(config, ratios, told)
-        changes = proposals(config, findings, told)
-        run.say(*lines(config, findings))
+            axis_check.require_unit(config, ratios, proved=True)
+        axis_check.require_gearing(config, ratios, told)
+        changes = axis_check.proposals(config, findings, told)
+        run.say(*axis_check.lines(config, findings))
         more = {"phone_turned_deg": round(findings.turned_deg, 2)}
     rounded = np.round(ratios, 4).tolist()
     evidence = {
@@ -71,7 +56,7 @@ def check_axes(run: Run, device: Device) -> list[Change]:
     run.emit("axes", sync=True, **evidence, changes=[str(change) for change in changes])
     if not changes:
         scales = [axis.pulses_per_deg for axis in config.axes]
-        turned = (rates_of(config, stands) * scales).round(6).tolist()
+        turned = (axis_check.rates_of(config, stands) * scales).round(6).tolist()
         turns = {"pulses": start.tolist(), "deg": turned}
         run.record.reach(SIGN_CHECKED, config, **evidence, turns=turns)
         run.say("each unit turns its joint in the right direction, about as commanded")
@@ -86,7 +71,8 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
     config, start = run.config, device.positions()
     room = [_room_deg(axis, at) for axis, at in zip(config.axes, start, strict=True)]
     # Of numbers it does not matter which axis carries which; of an arm it is known.
-    corners = corners_of(len(config.axes)) if config.imu and not config.is_arm else []
+    ordered = config.imu is None or config.is_arm
+    corners = [] if ordered else axis_check.corners_of(len(config.axes))
     run.say(
         f"axes: about {1 + 7 * len(start) + len(corners)} places; each axis first by "
         f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the measured motion "
@@ -101,12 +87,12 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         far, turned = tour.measure_axis(j)
         most = min(CORNER_DEG, room[j]) / abs(axis.to_deg(far))
         corner.append(round(far * min(REACH_DEG / turned, most)))
-    clear = CLEAR * tour.base.std_deg / CORNER_STD_DEG
+    clear = axis_check.CLEAR * tour.base.std_deg / CORNER_STD_DEG
     clear = int(np.ceil(clear**2 / max(1, len(corners))))
     samples = min(max(clear, config.settle.samples), 8 * config.settle.samples)
     for signs in corners:
         ways = {j: sign * corner[j] for j, sign in enumerate(signs)}
-        tour.visit(corner_name(config, signs), ways, samples)
+        tour.visit(axis_check.corner_name(config, signs), ways, samples)
     move(device, Posture("back", start))
     return tour.stands
 
@@ -117,9 +103,8 @@ def _room_deg(axis: Axis, pulses: int) -> float:
     room = min(here - axis.min_deg, axis.max_deg - here) - ROOM_DEG
     if room < REACH_DEG:
         raise Refused(
-            f"{axis.name} is {room + ROOM_DEG:.1f} deg from a limit; the check moves "
-            f"it {REACH_DEG:g} deg in either direction. Move it inwards: jaxcal-rig "
-            f"setup jog {axis.name} DEG"
+            f"{axis.name} is {room + ROOM_DEG:.1f} deg from a limit; it must go "
+            f"{REACH_DEG:g} either way. Move it: jaxcal-rig setup jog {axis.name} DEG"
         )
     return room
 
@@ -135,11 +120,10 @@ class _Tour:
         self.noise = SURE_SIGMA * self.base.std_deg * (2.0 / samples) ** 0.5
 
     def visit(self, name: str, offset: dict[int, int], samples: int = 0) -> Stand:
-        """Stand at pulses away from the start, and measure."""
         target = tuple(p + offset.get(axis, 0) for axis, p in enumerate(self.start))
-        stand = stand_at(self.run, self.device, Posture(name, target), samples)
-        self.stands[name] = stand
-        return stand
+        posture, stands = Posture(name, target), self.stands
+        stands[name] = axis_check.stand_at(self.run, self.device, posture, samples)
+        return stands[name]
 
     def turned(self, stand: Stand) -> float:
         """How far the phone turned from the start, or the numbers changed."""
@@ -175,7 +159,7 @@ class _Tour:
             geared = told / axis.pulses_per_rev
             ratios.append(geared * turned / abs(axis.to_deg(far)))
             self.visit(f"{axis.name}:back", {j: 0})
-        require_unit(config, ratios)
+        axis_check.require_unit(config, ratios)
 
     def measure_axis(self, j: int) -> tuple[int, float]:
         """Places of one axis, both ways; pulses of the furthest, and what it turned."""
@@ -188,9 +172,7 @@ class _Tour:
         if turned < max(SEEN_DEG * geometry.scale, least):
             raise MotionFault(
                 f"unit {axis.unit} turned its motor by {commanded:g} {axis.unit_name} "
-                f"of {axis.name}, and {geometry.told} {turned:.3g}. Check for a loose "
-                "coupling, a stream that does not change, or a reduction that is far "
-                "too small"
+                f"of {axis.name}, and {geometry.told} {turned:.3g}. {BLIND}"
             )
         # Once more on the way up, where its play is taken up.
         down = tuple(p - far * (i == j) for i, p in enumerate(self.start))

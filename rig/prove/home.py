@@ -7,7 +7,7 @@ import time
 from rig.command_run import Run
 from rig.config import RigConfig
 from rig.core.device import Device
-from rig.core.proof import NOISE_DEG
+from rig.core.proof import BLIND, NOISE_DEG
 from rig.drives.drive import HOME, Drive
 from rig.drives.line import BusError
 from rig.faults import MotionFault, Refused
@@ -34,7 +34,6 @@ def unlimited(config: RigConfig) -> RigConfig:
 
 
 def can_home(config: RigConfig) -> bool:
-    """Whether every drive has a homing of its own."""
     return all(axis.map.has("home") for axis in config.axes)
 
 
@@ -57,10 +56,8 @@ def home(run: Run, device: Device, config: RigConfig, here: bool) -> None:
 
 def _set_zero(run: Run, device: Device, drive: Drive) -> None:
     if not drive.can_set_zero:
-        run.say(
-            f"  {drive.axis.name}: drives of the map {drive.axis.map.name} cannot be "
-            f"set to a count; home is their count {drive.status().position}"
-        )
+        here = drive.status().position
+        run.say(f"  {drive.axis.name} cannot be set to a count: home is {here}")
         return
     if drive.counts_from_home:
         if _counts_from(device, drive, HOME) is None:
@@ -121,10 +118,8 @@ def _go_home(run: Run, device: Device, drive: Drive, range_deg: float) -> None:
         if not status.moving and waited > ANSWER_S and done:
             break
         if waited > HOME_S:
-            raise MotionFault(
-                f"{axis.name} is not home after {HOME_S:g} s. Check its home switch "
-                "and the homing set in the drive"
-            )
+            text = f"{axis.name} is not home after {HOME_S:g} s. Check its home switch"
+            raise MotionFault(f"{text} and the homing set in the drive")
         time.sleep(motion.poll_s)
     drive.forget_origin()
     device.guard()
@@ -141,17 +136,15 @@ def _check_homing(
     # Numbers have no speed of a joint.
     if device.config.imu and turned > most * RATE_S + NOISE_DEG:
         raise MotionFault(
-            f"{axis.name} homes at {turned / RATE_S:.0f} deg per second as measured by "
-            f"the phone, more than motion.max_speed_deg_s = {most:g}. Set the drive's "
-            "homing to a lower speed"
+            f"{axis.name} homes at {turned / RATE_S:.0f} deg/s by the phone, more than "
+            f"motion.max_speed_deg_s = {most:g}. Set its homing to a lower speed"
         )
     if abs(axis.to_deg(gone)) > BLIND_DEG and (
         apart(base, reading.value) < SEEN_DEG * scale
     ):
         raise MotionFault(
             f"the drive of {axis.name} has turned {abs(axis.to_deg(gone)):.0f} deg "
-            f"towards home, but {device.imu.whose} measured no motion. Check for a "
-            "loose coupling, a stream that does not change, or exchanged units"
+            f"towards home, but {device.imu.whose} measured no motion. {BLIND}"
         )
 
 

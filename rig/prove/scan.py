@@ -30,8 +30,6 @@ OF_LINE = OF_BUS | dict.fromkeys(("serial", "can"), ("device", "baudrate"))
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """A unit that answered."""
-
     unit: int
     families: tuple[str, ...]  # maps that its registers fit, the best first
     identity: dict[str, int]  # registers of the first of them
@@ -75,12 +73,8 @@ def serial_lines() -> list[str]:
     """One line for each serial port: device, and what its adapter calls itself."""
     from serial.tools import list_ports  # type: ignore[import-untyped]  # no stubs
 
-    lines = []
-    for port in sorted(list_ports.comports()):
-        usb = f", USB {port.vid:04x}:{port.pid:04x}" if port.vid is not None else ""
-        maker = f", {port.manufacturer}" if port.manufacturer else ""
-        lines.append(f"{port.device}: {port.description}{maker}{usb}")
-    return lines
+    ports = sorted(list_ports.comports())
+    return [f"{port.device}: {port.description} ({port.hwid})" for port in ports]
 
 
 def scan(
@@ -89,8 +83,7 @@ def scan(
     say: Callable[[str], None],
     maps: tuple[DriveMap, ...] = (),
 ) -> list[Answer]:
-    """Ask units 1 to ``units`` for their identity, under the lock of the bus; ``maps``
-    beside those that ship."""
+    """Ask units 1 to ``units``, under the bus's lock; ``maps`` beside those shipped."""
     every = [*maps, *(load_map(name) for name in available_maps())]
     named = {drive_map.name: drive_map for drive_map in every}.values()
     families = [drive_map for drive_map in named if isinstance(drive_map, RegisterMap)]
@@ -114,8 +107,7 @@ def scan(
         del answers[1:]
         say(
             f"{settings.where} answers for every unit id, even {NOBODY}, which no unit "
-            "has: it is one device, or a gateway that ignores the id. It is counted as "
-            "one unit"
+            "has: it is one device, or a gateway that ignores the id; counted as one"
         )
     if late:
         names = ", ".join(map(str, late))

@@ -52,8 +52,7 @@ class Operator:
         self._option = option
 
     def ask(self, question: str, default: str = "") -> str:
-        """An answer, or the default where none is given; Refused where there is neither
-        a terminal nor --yes, or no default."""
+        """An answer, or the default; Refused: no terminal and no --yes, or none."""
         if self.yes and not default:
             raise Refused(f"{question}: no default; pass it as an option")
         if self.yes:
@@ -194,11 +193,8 @@ def go_home(site: Site, here: bool) -> int:
     if not here:
         what = f"the drives run their own homing one after another, {', '.join(names)},"
         what += " as far and as fast as they are set"
-    site.operator.confirm(
-        "home: the drives are armed; keep out of the device's reach, hand on the "
-        f"emergency stop; {what}",
-        "home",
-    )
+    what = f"keep out of the device's reach, hand on the emergency stop; {what}"
+    site.operator.confirm(f"home: the drives are armed; {what}", "home")
     return site.run(
         "home", lambda run, dev: home(run, dev, site.config, here), limits=False,
         again="home" + " --here" * here,
@@ -255,9 +251,8 @@ def axes(site: Site) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
     site.operator.confirm(
         "axes: the device must be in its zero posture. Each axis in turn moves a "
-        "little, then up to 3 deg in either direction; then all axes move by turns, up "
-        "to 6 deg. Check that the joint that moves is the one named, and keep out of "
-        "the device's reach",
+        "little, then up to 3 deg either way; then all move by turns, up to 6 deg. See "
+        "that the joint that moves is the one named; keep out of the device's reach",
         "axes",
     )
     return _check_axes(site)
@@ -272,14 +267,11 @@ def _check_axes(site: Site, again: bool = False) -> int:
     for change in changes:
         site.say(f"  {change}")
     if again or site.path is None:
-        site.say(
-            "the device is NOT SIGN_CHECKED: correct rig.toml, then run `jaxcal-rig "
-            "axes` again"
-        )
+        advice = "correct rig.toml, then run `jaxcal-rig setup axes` again"
+        site.say(f"the device is NOT SIGN_CHECKED: {advice}")
         return EXIT_RECALIBRATE
-    site.operator.confirm(
-        f"axes: write these values to {site.path}, then move the axes again", "correct"
-    )
+    what = f"write these values to {site.path}, then move the axes again"
+    site.operator.confirm(f"axes: {what}", "correct")
     # What was proved of the drives goes with their cables.
     site.take(edit(site.path, {change.key: change.new for change in changes}))
     site.say(f"  written; the old file is next to {site.path}")
@@ -292,11 +284,9 @@ def _check_axes(site: Site, again: bool = False) -> int:
 
 def take_zero(site: Site) -> int:
     """Measure the zero posture: ZEROED."""
-    site.operator.confirm(
-        "zero: the device must be in its zero posture (jig, level), or moves to pulse "
-        '0 with session.zero = "drive"; this posture is measured as zero',
-        "zero",
-    )
+    what = "the device must be in its zero posture (jig, level), or moves to pulse 0 "
+    what += 'with session.zero = "drive"; this posture is measured as zero'
+    site.operator.confirm(f"zero: {what}", "zero")
     return site.run("zero", lambda run, device: session.take_zero(device))
 
 

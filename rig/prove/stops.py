@@ -44,6 +44,7 @@ BY_UNITS = "the stop of each unit"
 
 Times = list[tuple[float, float]]
 Act = Callable[[Device], Times]
+Ends = tuple[Pulses, Pulses]  # of a move
 
 
 class _ShareReached(Exception):
@@ -60,13 +61,11 @@ class StopTrial(NamedTuple):
 
 
 def prove_stops(run: Run, device: Device) -> None:
-    """Try each way to stop; the device is STOP_PROVED. MotionFault: an axis went on, or
-    moved again."""
-    start, axes = device.positions(), run.config.axes
+    """Try each way to stop: STOP_PROVED. MotionFault: an axis went on, or again."""
+    start, axes, trials = device.positions(), run.config.axes, _Trials(run, device)
     evidence: dict[str, dict[str, float]] = {}
     distances: dict[str, dict[str, Any]] = {}
-    way = _way_deg(run)
-    offsets = [axis.to_pulses(way / 2) for axis in axes]
+    offsets = [axis.to_pulses(trials.way_deg / 2) for axis in axes]
     low = tuple(p - offset for p, offset in zip(start, offsets, strict=True))
     high = tuple(p + offset for p, offset in zip(start, offsets, strict=True))
     silent_s = max(run.config.comm_timeouts_s.values(), default=0.0) + SILENCE_S
@@ -74,7 +73,7 @@ def prove_stops(run: Run, device: Device) -> None:
     if device.line.stops_at_once(device.drives):
         ways["the broadcast stop"] = (_broadcast, SPEED_DEG_S)
     if silent_s > SILENCE_S:
-        slow = min(SPEED_DEG_S, (1.0 - LATE - SHORT) * way / silent_s)
+        slow = min(SPEED_DEG_S, (1.0 - LATE - SHORT) * trials.way_deg / silent_s)
         be_silent = functools.partial(_be_silent, seconds=silent_s)
         ways["their watch of the line"] = (be_silent, slow)
     every = [*range(len(axes))]
@@ -82,10 +81,10 @@ def prove_stops(run: Run, device: Device) -> None:
     for name, (act, speed) in ways.items():
         for moved in together:
             end = tuple(high[i] if i in moved else low[i] for i in every)
-            tried = _prove(run, device, name, act, speed, low, end)
+            tried = trials.prove(name, act, speed, (low, end))
             evidence[name] = evidence.get(name, {}) | tried.after_deg
             if name == BY_UNITS:
-                distances |= _distances(run, device, tried, low, end)
+                distances |= trials.distances(tried, (low, end))
     device.proof.ceiling_deg_s = None
     move(device, Posture("back", start))
     more = {"ways": evidence, "distances": distances}
@@ -95,66 +94,161 @@ def prove_stops(run: Run, device: Device) -> None:
     run.say(f"the drives stop and do not move on: {', '.join(evidence)}")
 
 
-def _way_deg(run: Run) -> float:
-    return 2 * REACH_DEG * min(1.0, ADD_UP / len(run.config.axes))
+class _Trials:
+    """Stops of one device, tried one after another."""
 
+    def __init__(self, run: Run, device: Device) -> None:
+        self.run, self.device, self.axes = run, device, run.config.axes
+        self.way_deg = 2 * REACH_DEG * min(1.0, ADD_UP / len(self.axes))
 
-def _distances(
-    run: Run, device: Device, first: StopTrial, low: Pulses, high: Pulses
-) -> dict[str, dict[str, Any]]:
-    """Speeds of two stops and how far each axis went on, for ``StopDistance.of``."""
-    tries, way, fast = [first], _way_deg(run), FAST_DEG_S
-    timed = [axis for axis in run.config.axes if axis.name in first.speeds]
-    for axis in timed:
-        speed, accel = axis.drive_motion
-        rest = (1.0 - LATE - SHORT) * way / max(abs(first.after_deg[axis.name]), 1e-3)
-        reached = (BEGIN * way * accel) ** 0.5  # within less than BEGIN of its way
-        fast = min(fast, speed, reached, first.speeds[axis.name] * rest**0.5)
-    if fast > FASTER * max(first.speeds.values()):
-        usual = max(_least_s(drive) for drive in device.drives)
-        device.proof.stop_proved = True
-        try:
-            trials = [_timed(run, device, [], fast, low, high, usual)]
-            if trials[0].speeds:
-                slow = max(first.speeds.values())
-                tries = [_timed(run, device, [first], slow, low, high, usual), *trials]
-        finally:
-            device.proof.stop_proved = False
-    points = {}
-    for axis in timed:
-        speed, accel = axis.drive_motion
-        point: dict[str, Any] = {
-            "speeds": [round(trial.speeds[axis.name], 4) for trial in tries],
-            "distances": [round(trial.distances[axis.name], 4) for trial in tries],
-            "accel": round(accel, 4),
+    def distances(self, first: StopTrial, ends: Ends) -> dict[str, dict[str, Any]]:
+        """Speeds of two stops and how far axes went on, for ``StopDistance.of``."""
+        tries, way, fast = [first], self.way_deg, FAST_DEG_S
+        timed = [axis for axis in self.axes if axis.name in first.speeds]
+        for axis in timed:
+            speed, accel = axis.drive_motion
+            gone = max(abs(first.after_deg[axis.name]), 1e-3)
+            rest = (1.0 - LATE - SHORT) * way / gone
+            reached = (BEGIN * way * accel) ** 0.5  # within less than BEGIN of its way
+            fast = min(fast, speed, reached, first.speeds[axis.name] * rest**0.5)
+        if fast > FASTER * (slow := max(first.speeds.values())):
+            self.device.proof.stop_proved = True
+            try:
+                quick = self._surest([], fast, ends)
+                if quick.speeds:
+                    tries = [self._surest([first], slow, ends), quick]
+            finally:
+                self.device.proof.stop_proved = False
+        points = {}
+        for axis in timed:
+            speed, accel = axis.drive_motion
+            point: dict[str, Any] = {
+                "speeds": [round(trial.speeds[axis.name], 4) for trial in tries],
+                "distances": [round(trial.distances[axis.name], 4) for trial in tries],
+                "accel": round(accel, 4),
+            }
+            points[axis.name] = point
+            distance, unit = StopDistance.of(**point), axis.unit_name
+            slowest = distance.fastest(axis, 0.0)
+            self.run.say(
+                f"  {axis.name}: stopping distance {distance.at(speed):.2g} {unit} at "
+                f"{speed:.4g} {unit}/s"
+                + f"; moves that end at a limit run at {slowest:.3g} {unit}/s, moves "
+                "that end further inside run faster" * (slowest < speed)
+            )
+        return points
+
+    def _surest(self, trials: list[StopTrial], speed: float, ends: Ends) -> StopTrial:
+        """The trial of a speed whose times are surest, again on a busy computer."""
+        name = f"{BY_UNITS}, at {speed:.3g} {self.run.config.axis_unit}/s"
+        sure_s = UNSURE * max(map(_least_s, self.device.drives)) + UNSURE_S
+        while len(trials) < REPEATS and all(t.unsure_s > sure_s for t in trials):
+            trials.append(self.prove(name, _stop_units, speed, ends, look=False))
+        return min(trials, key=lambda trial: trial.unsure_s)
+
+    def prove(
+        self, name: str, act: Act, speed_deg_s: float, ends: Ends, look: bool = True
+    ) -> StopTrial:
+        """Stop a move between ends; ``look`` whether all stay where they stand."""
+        device, config, low = self.device, self.run.config, ends[0]
+        for number in range(TRIES):
+            device.proof.ceiling_deg_s = None
+            move(device, Posture("the start of the stop", low))
+            device.proof.ceiling_deg_s = speed_deg_s / 2**number
+            places = _go(device, ends)
+            if max(_shares(ends, places)) <= LATE:
+                break
+            _wait_until_still(device)  # it may end
+            device.untrack()
+        else:
+            raise MotionFault(
+                "no move is slow enough to be stopped before its end: bus and computer "
+                "take too long between two polls of the drives"
+            )
+        last = [_last(drive) for drive in device.drives]
+        told = [drive.axis.drive_motion[0] for drive in device.drives]
+        sent = act(device)
+        statuses = _wait_until_still(device)
+        at = [status.position for status in statuses]
+        gone, rows = _shares(ends, at), zip(config.axis_names, *ends, strict=True)
+        going = [axis for axis, a, b in rows if a != b]
+        self._require_stopped(name, statuses, dict(zip(going, gone, strict=True)), look)
+        after_deg = {
+            axis.name: round(axis.to_deg(b - a), 3)
+            for axis, a, b in zip(self.axes, places, at, strict=True)
+            if axis.name in going
         }
-        points[axis.name] = point
-        distance, unit = StopDistance.of(**point), axis.unit_name
-        slowest = distance.fastest(axis, 0.0)
-        run.say(
-            f"  {axis.name}: stopping distance {distance.at(speed):.2g} {unit} at "
-            f"{speed:.4g} {unit}/s"
-            + f"; moves that end at a limit run at {slowest:.3g} {unit}/s, moves that "
-            "end further inside run faster" * (slowest < speed)
+        self.run.say(
+            f"  {name}: stood after "
+            + ", ".join(f"{axis} {abs(deg):.2f}" for axis, deg in after_deg.items())
+            + f" {config.axis_unit}"
+            + f", and {stop.stand_s(device.drives):g} s later" * look
         )
-    return points
+        speeds: dict[str, float] = {}
+        distances: dict[str, float] = {}
+        unsure_s = 0.0
+        trials = zip(self.axes, low, last, told, sent, strict=False)
+        for axis, begun, before, asked_deg_s, (sent_s, heard_s) in trials:
+            # Its target, not its stop, may be where it stands.
+            if axis.name in after_deg and max(gone) <= 1.0 - SHORT:
+                seen_s = (before.asked + 3.0 * before.time) / 4.0  # status, position
+                way = abs(axis.to_deg(before.position - begun))
+                speed = min(asked_deg_s, (2.0 * axis.drive_motion[1] * way) ** 0.5)
+                meanwhile = speed * max(0.0, (sent_s + heard_s) / 2.0 - seen_s)
+                went_on = abs(after_deg[axis.name]) - meanwhile
+                speeds[axis.name], distances[axis.name] = speed, max(0.0, went_on)
+                took_s = before.time - before.asked + heard_s - sent_s
+                unsure_s = max(unsure_s, took_s)
+        return StopTrial(after_deg, speeds, distances, unsure_s if speeds else math.inf)
 
+    def _require_stopped(
+        self, name: str, statuses: list[Status], shares: dict[str, float], look: bool
+    ) -> None:
+        """Reset alarms; ``look``: MotionFault where an axis went on, or moved again."""
+        device, geometry = self.device, self.device.geometry
+        if not look:
+            self._reset_alarms(name)
+            return device.untrack()
+        went_on = [axis for axis, share in shares.items() if share > 1.0 - SHORT]
+        attitude = device.attitude(time.monotonic())
+        pairs = zip(device.drives, _look(device, statuses), statuses, strict=True)
+        moved = [
+            drive.axis.name
+            for drive, now, then in pairs
+            if abs(now.position - then.position) > STILL_COUNTS and now.enabled
+        ]
+        turned = geometry.apart(attitude, device.attitude(time.monotonic()))
+        self._reset_alarms(name)
+        device.untrack()
+        if went_on:
+            raise MotionFault(
+                f"{', '.join(went_on)} moved on to the target after {name}: this "
+                "program cannot stop it. Correct [stop], broadcast_stop or "
+                "[comm_timeout] of the map; until then only the emergency stop stops "
+                "the device"
+            )
+        if moved or turned > TURNED_DEG * geometry.scale:
+            raise MotionFault(
+                f"{', '.join(moved) or 'the measured part'} moved again after {name} "
+                f"({geometry.told} {turned:.2f} {geometry.unit}). Set the drive so "
+                "that it does not move on after a stop"
+            )
 
-def _timed(
-    run: Run,
-    device: Device,
-    trials: list[StopTrial],
-    speed: float,
-    low: Pulses,
-    high: Pulses,
-    usual_s: float,
-) -> StopTrial:
-    """The trial of a speed whose times are surest, tried again on a busy computer."""
-    name = f"{BY_UNITS}, at {speed:.3g} {run.config.axis_unit}/s"
-    sure_s = UNSURE * usual_s + UNSURE_S
-    while len(trials) < REPEATS and all(t.unsure_s > sure_s for t in trials):
-        trials.append(_prove(run, device, name, _stop_units, speed, low, high, False))
-    return min(trials, key=lambda trial: trial.unsure_s)
+    def _reset_alarms(self, name: str) -> None:
+        """Reset alarms of drives that raise one when they stop themselves."""
+        for drive in self.device.drives:
+            axis = drive.axis.name
+            if not drive.status().fault:
+                continue
+            reset = drive.can_reset and drive.bring(drive.reset, lambda s: not s.fault)
+            if not reset or reset.fault:
+                raise MotionFault(
+                    f"{axis} stays in alarm after {name}: {drive.alarm()}. "
+                    "Reset it, then run `jaxcal-rig setup axes` again"
+                )
+            self.run.say(f"  {axis}: its alarm after {name} was reset")
+            if not drive.bring(drive.arm, lambda status: status.enabled).enabled:
+                raise MotionFault(f"{axis} does not enable after {name}")
 
 
 def _least_s(drive: Drive) -> float:
@@ -163,119 +257,18 @@ def _least_s(drive: Drive) -> float:
     return 1.5 * min(look.time - look.asked for look in looks)
 
 
-def _prove(
-    run: Run,
-    device: Device,
-    name: str,
-    act: Act,
-    speed_deg_s: float,
-    low: Pulses,
-    high: Pulses,
-    look: bool = True,
-) -> StopTrial:
-    """Stop a move from low to high; ``look`` whether all stay where they stand."""
-    for number in range(TRIES):
-        device.proof.ceiling_deg_s = None
-        move(device, Posture("the start of the stop", low))
-        device.proof.ceiling_deg_s = speed_deg_s / 2**number
-        places = _go(device, low, high)
-        if max(_shares(device, low, high, places)) <= LATE:
-            break
-        _wait_until_still(device)  # it may end
-        device.untrack()
-    else:
-        raise MotionFault(
-            "no move is slow enough to be stopped before its end: bus and computer "
-            "take too long between two polls of the drives"
-        )
-    last = [_last(drive) for drive in device.drives]
-    told = [drive.axis.drive_motion[0] for drive in device.drives]
-    sent = act(device)
-    statuses = _wait_until_still(device)
-    at = [status.position for status in statuses]
-    gone = _shares(device, low, high, at)
-    ends = zip(run.config.axis_names, low, high, strict=True)
-    going = [axis for axis, a, b in ends if a != b]
-    shares = dict(zip(going, gone, strict=True))
-    _require_stopped(run, device, name, statuses, shares, look)
-    after_deg = {
-        axis.name: round(axis.to_deg(b - a), 3)
-        for axis, a, b in zip(run.config.axes, places, at, strict=True)
-        if axis.name in going
-    }
-    run.say(
-        f"  {name}: stood after "
-        + ", ".join(f"{axis} {abs(deg):.2f}" for axis, deg in after_deg.items())
-        + f" {run.config.axis_unit}"
-        + f", and {stop.stand_s(device.drives):g} s later" * look
-    )
-    speeds: dict[str, float] = {}
-    distances: dict[str, float] = {}
-    unsure_s = 0.0
-    rows = zip(run.config.axes, low, last, told, sent, strict=False)
-    for axis, begun, before, asked_deg_s, (sent_s, heard_s) in rows:
-        # Its target, not its stop, may be where it stands.
-        if axis.name in after_deg and max(gone) <= 1.0 - SHORT:
-            seen_s = (before.asked + 3.0 * before.time) / 4.0  # status, then position
-            way = abs(axis.to_deg(before.position - begun))
-            speed = min(asked_deg_s, (2.0 * axis.drive_motion[1] * way) ** 0.5)
-            meanwhile = speed * max(0.0, (sent_s + heard_s) / 2.0 - seen_s)
-            went_on = abs(after_deg[axis.name]) - meanwhile
-            speeds[axis.name], distances[axis.name] = speed, max(0.0, went_on)
-            took_s = before.time - before.asked + heard_s - sent_s
-            unsure_s = max(unsure_s, took_s)
-    return StopTrial(after_deg, speeds, distances, unsure_s if speeds else math.inf)
-
-
-def _require_stopped(
-    run: Run,
-    device: Device,
-    name: str,
-    statuses: list[Status],
-    shares: dict[str, float],
-    look: bool,
-) -> None:
-    """Reset alarms; ``look``: MotionFault where an axis went on, or moved again."""
-    if not look:
-        _reset_alarms(run, device, name)
-        return device.untrack()
-    went_on = [axis for axis, share in shares.items() if share > 1.0 - SHORT]
-    attitude = device.attitude(time.monotonic())
-    after = _look(device, statuses)
-    moved = [
-        axis
-        for axis, now, then in zip(run.config.axis_names, after, statuses, strict=True)
-        if abs(now.position - then.position) > STILL_COUNTS and now.enabled
-    ]
-    turned = device.geometry.apart(attitude, device.attitude(time.monotonic()))
-    _reset_alarms(run, device, name)
-    device.untrack()
-    if went_on:
-        raise MotionFault(
-            f"{', '.join(went_on)} moved on to the target after {name}: this program "
-            "cannot stop it. Correct [stop], broadcast_stop or [comm_timeout] of the "
-            "map; until then only the emergency stop stops the device"
-        )
-    if moved or turned > TURNED_DEG * device.geometry.scale:
-        raise MotionFault(
-            f"{', '.join(moved) or 'the measured part'} moved again after {name} "
-            f"({device.geometry.told} {turned:.2f} {device.geometry.unit}). Set the "
-            "drive so that it does not move on after a stop"
-        )
-
-
-def _go(device: Device, low: Pulses, high: Pulses) -> list[int]:
+def _go(device: Device, ends: Ends) -> list[int]:
     """Begin to move; where the drives are once all have gone BEGIN of their way."""
 
     def look() -> None:
         places = [_last(drive).position for drive in device.drives]
-        if min(_shares(device, low, high, places)) >= BEGIN:
+        if min(_shares(ends, places)) >= BEGIN:
             raise _ShareReached
 
     device.meanwhile = look
     try:
         with contextlib.suppress(_ShareReached):
-            move(device, Posture("try the stop", high))
+            move(device, Posture("try the stop", ends[1]))
     finally:
         device.meanwhile = lambda: None
     return [_last(drive).position for drive in device.drives]
@@ -286,11 +279,9 @@ def _last(drive: Drive) -> Status:
     return drive.last
 
 
-def _shares(
-    device: Device, low: Pulses, high: Pulses, at: Sequence[int]
-) -> list[float]:
+def _shares(ends: Ends, at: Sequence[int]) -> list[float]:
     """Shares of the way that those axes have gone that move."""
-    return [(p - a) / (b - a) for a, b, p in zip(low, high, at, strict=True) if a != b]
+    return [(p - a) / (b - a) for a, b, p in zip(*ends, at, strict=True) if a != b]
 
 
 def _stop_units(device: Device) -> Times:
@@ -303,7 +294,7 @@ def _stop_units(device: Device) -> Times:
 
 
 def _broadcast(device: Device) -> Times:
-    stop.broadcast(device.drives)
+    device.line.stop_at_once(device.drives)
     return []
 
 
@@ -347,18 +338,3 @@ def _look(device: Device, statuses: list[Status]) -> list[Status]:
             return _wait_until_still(device)
         time.sleep(stop.LOOK_S)
     return [drive.steady() for drive in device.drives]
-
-
-def _reset_alarms(run: Run, device: Device, name: str) -> None:
-    """Reset alarms of drives that raise one when they stop themselves."""
-    for drive in device.drives:
-        if not drive.status().fault:
-            continue
-        if not drive.can_reset or drive.bring(drive.reset, lambda s: not s.fault).fault:
-            raise MotionFault(
-                f"{drive.axis.name} stays in alarm after {name}: {drive.alarm()}. "
-                "Reset it, then run `jaxcal-rig setup axes` again"
-            )
-        run.say(f"  {drive.axis.name}: its alarm after {name} was reset")
-        if not drive.bring(drive.arm, lambda status: status.enabled).enabled:
-            raise MotionFault(f"{drive.axis.name} does not enable after {name}")

@@ -58,7 +58,7 @@ def test_a_computer_that_slept_is_named(monkeypatch, moves):
     monkeypatch.setattr(heartbeat, "clock_ahead_s", lambda: ahead[0])
     told_events = []
     with bench(arm=False) as motion:
-        motion.device.stopper._emit = lambda event, **f: told_events.append(f)
+        motion.device.stopper.emit = lambda event, **f: told_events.append(f)
         motion.device.arm()
         time.sleep(0.2)
         motion.device.heartbeat.feed(moving=moves)
@@ -96,7 +96,7 @@ def test_crawls_are_no_slower_than_a_drive_can_begin(reduction, asked, seen, fau
     )  # fmt: skip
     at = [
         Status(
-            0, round(seen * t * scale.pulses_per_deg), t, t, True, False, True, False
+            round(seen * t * scale.pulses_per_deg), True, False, True, False, 0, t, t
         )
         for t in np.arange(0.0, 2.0, 0.05)
     ]

@@ -228,7 +228,7 @@ def test_a_drive_that_ignores_its_speed_is_named(factor, at, capsys, monkeypatch
 
 
 @pytest.mark.slow
-def test_axes_tell_the_speed_that_they_saw(at, capsys, monkeypatch):
+def test_axes_stop_a_drive_that_is_too_fast(at, capsys, monkeypatch):
     monkeypatch.setattr(motion, "TOO_FAST", 1.6)
     with device(speedup=1.0) as (sim, bus, port):
         text = quick_text(bus, port).replace("= 400", "= 20")
@@ -240,8 +240,6 @@ def test_axes_tell_the_speed_that_they_saw(at, capsys, monkeypatch):
         assert "yaw moves at" in capsys.readouterr().out
         sim.faults.clear()
         assert main(["axes", "--yes"]) == 0
-        out = capsys.readouterr().out
-    assert out.count(": at least ") == 3
 
 
 # D, E: the stop

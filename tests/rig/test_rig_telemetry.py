@@ -38,7 +38,7 @@ class Polled:
         self.axis = axis
         self.last = None
         if position is not None:
-            self.last = Status(0, position, 0.0, 0.0, True, True, False, False)
+            self.last = Status(position, True, True, False, False, 0)
 
 
 def made(folder, imu, frame=None, positions=(None, None, None)):

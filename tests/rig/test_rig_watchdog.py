@@ -199,11 +199,11 @@ def test_a_drive_that_was_set_again_since_the_kill_keeps_that():
     config = fast_config(WATCHED)
     with bench(config, arm=False) as motion:
         sim, device = motion.sim, motion.device
-        device.line_watch._left = {"pitch": {"before": 7, "counts": 2750}}
+        device.emit("comm_timeout", axis="pitch", before=7, counts=2750)
         sim.drives[0].write(REGISTER, [1234])
         device.arm()
         device.stopper.stop("", latch=False)
-        device.line_watch.restore({"pitch", "yaw", "roll"})
+        device._restore_watches({"pitch", "yaw", "roll"})
         assert timeouts(sim)[0] == 1234
 
 
