@@ -18,7 +18,7 @@ import numpy as np
 
 from rig.config.settings import ImuSettings
 from rig.readings.attitude import Array, Reading
-from rig.readings.source import BACKLOG, Source, listener_of
+from rig.readings.source import Source, listener_of
 from rig.readings.stream import MAX_BODY, LineSplitter, StreamParser
 
 RECONNECT_S = 0.2
@@ -28,8 +28,27 @@ MAX_HEAD = 8192  # bytes of a message before its body
 LOOK_S = 0.05  # between two looks at whether to end
 
 
+@dataclasses.dataclass(eq=False)
+class Connection:
+    """One that is open."""
+
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+    address: str
+    since: float  # it was made, or is heard
+    used: float = 0.0  # a reading of it was last of use
+    splitter: LineSplitter = dataclasses.field(default_factory=LineSplitter)
+
+
 class Imu(Source):
-    """The attitude of the phone, (3, 3) to its world."""
+    """The attitude of the phone, (3, 3) to its world: of one, whoever else connects.
+
+    Who may not be heard is refused unread. At most MOST_OPEN connections are open, none
+    for longer than PATIENCE_S without a word; the oldest that has sent nothing makes
+    way for the next. Messages are pushed over any connection of one address. Lines come
+    over one: a phone that lost its Wi-Fi comes back on another, which takes its place
+    once no reading of the old was of use for ``stale_s``; until then it is refused.
+    """
 
     whose, table = "the phone", "imu"
     start, lost = "start its app", "Check its Wi-Fi, and that its app is in front"
@@ -39,43 +58,43 @@ class Imu(Source):
         settings: ImuSettings,
         report: Callable[..., object] = lambda event, **fields: None,
     ) -> None:
-        """``report`` gets an event and its fields, on the receiving thread."""
         super().__init__(settings.stale_s, report)
         self.settings: ImuSettings = settings
-        self.connections = 0
         self.world = np.eye(3)
         self.parser = StreamParser(settings)
         self._counts = self.parser.counts
-        self._receiver: Receiver | None = None
+        self._current: Connection | None = None  # that lines are taken of
+        self._unheard: list[asyncio.Task[None]] = []  # that have sent nothing yet
+        self._closing = threading.Event()
+        self._port = settings.port
+        self._listener: socket.socket | None = None
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._run()), name="imu", daemon=True
+        )
 
     def open(self) -> Imu:
-        """Listen, or begin to connect; ReadingError where the port cannot be opened."""
         try:
-            self._receiver = Receiver(self)
+            self._listener = listener_of(self.settings)
         except OSError as error:
             raise self.closed(error) from None
+        if self._listener is not None:
+            self._listener.setblocking(False)
+            self._port = int(self._listener.getsockname()[1])
+        self._thread.start()
         return self
 
     def close(self) -> None:
-        if self._receiver is not None:
-            self._receiver.close()
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
 
     @property
     def port(self) -> int:
-        return self._receiver.port if self._receiver else self.settings.port
-
-    @property
-    def sender(self) -> str:  # type: ignore[override]  # known by the receiver
-        """Address of the phone that is heard; empty while there is none."""
-        return self._receiver.phone if self._receiver else ""
+        return self._port
 
     @property
     def where(self) -> str:
         return f"{self.settings.host}:{self.port}"
-
-    @property
-    def refused(self) -> list[str]:
-        return self._receiver.refused if self._receiver else []
 
     def turn(self, world: Array) -> None:
         """Turn all readings by (3, 3), those that were received too."""
@@ -108,101 +127,50 @@ class Imu(Source):
         turned = [Reading(r.time, self.world @ r.value) for r in readings]
         return self.store(turned)
 
-
-@dataclasses.dataclass(eq=False)
-class Connection:
-    """One that is open."""
-
-    reader: asyncio.StreamReader
-    writer: asyncio.StreamWriter
-    address: str
-    since: float  # it was made, or is heard
-    used: float = 0.0  # a reading of it was last of use
-    splitter: LineSplitter = dataclasses.field(default_factory=LineSplitter)
-
-
-class Receiver:
-    """Hears one phone, whoever else connects.
-
-    Who may not be heard is refused unread. At most MOST_OPEN connections are open, none
-    for longer than PATIENCE_S without a word; the oldest that has sent nothing makes
-    way for the next. Messages are pushed over any connection of one address. Lines come
-    over one: a phone that lost its Wi-Fi comes back on another, which takes its place
-    once no reading of the old was of use for ``stale_s``; until then it is refused.
-    """
-
-    def __init__(self, imu: Imu) -> None:
-        """OSError where the port cannot be opened."""
-        self._imu = imu
-        self._settings = s = imu.settings
-        self.port = s.port
-        self.phone = ""  # address that is heard, once a reading of it was used
-        self.refused: list[str] = []  # addresses
-        self._current: Connection | None = None  # that lines are taken of
-        self._unheard: list[asyncio.Task[None]] = []  # that have sent nothing yet
-        self._closing = threading.Event()
-        self._listener = listener_of(s)
-        if self._listener is not None:
-            self._listener.setblocking(False)
-            self.port = self._listener.getsockname()[1]
-        self._thread = threading.Thread(
-            target=lambda: asyncio.run(self._run()), name="imu", daemon=True
-        )
-        self._thread.start()
-
-    def close(self) -> None:
-        self._closing.set()
-        self._thread.join(2.0)
-
     def refuse(self, address: str, why: str) -> None:
         """Tell of a sender that is not heard, once for each address."""
         if address not in self.refused:
             self.refused.append(address)
             text = f"refused a sender on the IMU port, {address}: {why}"
-            self._imu.report("sender_refused", address=address, reason=text)
+            self.report("sender_refused", address=address, reason=text)
 
     def _admits(self, address: str) -> bool:
-        allowed = self._settings.allow
+        allowed = self.settings.allow
         if allowed and address not in allowed:
             self.refuse(address, f"it is not in imu.allow ({', '.join(allowed)})")
-        elif self.phone and address != self.phone:
-            self.refuse(address, f"{self.phone} is the phone of this session")
+        elif self.sender and address != self.sender:
+            self.refuse(address, f"{self.sender} is the phone of this session")
         else:
             return True
         return False
 
     async def _run(self) -> None:
-        if self._listener is None:
-            way = self._connect()
-        elif self._settings.transport == "udp":
-            way = self._datagrams(self._listener)
-        else:
-            way = self._accept(self._listener)
-        receiving = asyncio.create_task(way)  # which ends with this
+        ways = {"connect": self._connect, "udp": self._datagrams}
+        way = ways.get(self.settings.transport, self._accept)
+        receiving = asyncio.create_task(way(self._listener))  # which ends with this
         while not (self._closing.is_set() or receiving.done()):
             await asyncio.sleep(LOOK_S)
 
-    async def _datagrams(self, listener: socket.socket) -> None:
+    async def _datagrams(self, listener: Any) -> None:
         """Lines of datagrams, each of them whole."""
         loop = asyncio.get_running_loop()
-        self._imu.begin()
+        self.begin()
         with listener:
             while True:
                 data, (address, *_) = await loop.sock_recvfrom(listener, 65536)
                 lines = [line for line in re.split(rb"[\r\n]+", data) if line]
                 if self._admits(address) and lines:
-                    if self._imu.take_lines(lines, time.monotonic()):
-                        self.phone = address
+                    if self.take_lines(lines, time.monotonic()):
+                        self.sender = address
 
-    async def _connect(self) -> None:
-        s = self._settings
+    async def _connect(self, _: Any) -> None:
+        s = self.settings
         while True:
             await self._hear(s.host, host=s.host, port=s.port)
             await asyncio.sleep(RECONNECT_S)
 
-    async def _accept(self, listener: socket.socket) -> None:
+    async def _accept(self, listener: Any) -> None:
         loop, tasks = asyncio.get_running_loop(), set[asyncio.Task[None]]()
-        leaving: list[socket.socket] = []
         with listener:
             while True:
                 try:
@@ -222,8 +190,7 @@ class Receiver:
                 else:  # it is still sending: closed at once, it would not see why
                     with contextlib.suppress(OSError):
                         made.send(_answer(403, False))
-                    leaving = [*(c for c in leaving if c.fileno() >= 0), made]
-                    loop.call_later(LOOK_S * (len(leaving) < BACKLOG), made.close)
+                    loop.call_later(LOOK_S, made.close)
 
     def _has_sent(self, task: asyncio.Task[None] | None) -> None:
         if task in self._unheard:
@@ -231,7 +198,7 @@ class Receiver:
 
     async def _hear(self, address: str, **how: Any) -> None:
         """Take what one connection sends, until it ends or says nothing."""
-        pushed = self._settings.format == "sensorlogger"
+        pushed = self.settings.format == "sensorlogger"
         hear = self._message if pushed else self._lines
         ended = (OSError, EOFError, ValueError, asyncio.LimitOverrunError)
         with contextlib.suppress(*ended):
@@ -252,7 +219,7 @@ class Receiver:
         """Take what has come in; whether the connection stays open."""
         data = await connection.reader.read(4096)
         now, current = time.monotonic(), self._current
-        stale_s = self._settings.stale_s
+        stale_s = self.settings.stale_s
         if data and current is not connection:
             if current and now - max(current.since, current.used) <= stale_s:
                 if goes_on := current.used > connection.since + stale_s:
@@ -262,9 +229,9 @@ class Receiver:
             if current:
                 current.writer.close()
             self._current, connection.since = connection, now
-            self._imu.begin()
-        if self._imu.take_lines(connection.splitter.feed(data), now):
-            connection.used, self.phone = now, connection.address
+            self.begin()
+        if self.take_lines(connection.splitter.feed(data), now):
+            connection.used, self.sender = now, connection.address
         return bool(data)
 
     async def _message(self, connection: Connection) -> bool:
@@ -280,12 +247,13 @@ class Receiver:
                 connection.writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
             body = await connection.reader.readexactly(int(length))
             if admitted := self._admits(connection.address):
-                used, foreign = self._imu.take_body(body)
+                used, foreign = self.take_body(body)
                 if foreign:
                     why = "another device sends from there now"
                     self.refuse(connection.address, why)
                 admitted = not foreign
-                self.phone = connection.address if used else self.phone
+                if used:
+                    self.sender = connection.address
             code = 200 if admitted else 403
         stays = admitted and fields.get("connection") != "close"
         connection.writer.write(_answer(code, stays))

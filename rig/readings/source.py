@@ -69,7 +69,7 @@ class Source(abc.ABC):
     start = "switch it on"
     lost = "Check its power and cable"
     settings: Any  # ImuSettings, ReadingsSettings
-    sender = ""  # address that is heard
+    sender = ""  # address that is heard, once a reading of it was used
     connections = 0  # a heading may be another one after a new connection
     world: Array = np.eye(3)  # by which attitudes are turned
 
@@ -81,6 +81,7 @@ class Source(abc.ABC):
         """``report`` gets an event and its fields, on the receiving thread."""
         self.stale_s = stale_s
         self.report = report
+        self.refused: list[str] = []  # addresses that were not let in
         self._lock = threading.Lock()
         self._ring: deque[Reading] = deque(maxlen=RING)
         self._counts: Counter[str] = Counter()
@@ -105,11 +106,6 @@ class Source(abc.ABC):
     def port(self) -> int:
         """TCP or UDP port, where there is one."""
         return 0
-
-    @property
-    def refused(self) -> list[str]:
-        """Addresses that were not let in."""
-        return []
 
     def turn(self, world: Array) -> None:
         """Turn all readings, those that were received too; of attitudes alone."""

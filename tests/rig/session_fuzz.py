@@ -458,18 +458,11 @@ class FuzzWire(Wire):
             self.world.advance(min(end, due) - self.world.now)
 
 
-class FuzzReceiver:
+def opened_in(world: World, imu: phones.Imu) -> phones.Imu:
     """A phone that connects when the session opens its port."""
-
-    world: World
-    port, phone, refused = 1, "127.0.0.1", ()
-
-    def __init__(self, imu: phones.Imu) -> None:
-        self.world.imu = imu
-        imu.begin()
-
-    def close(self) -> None:
-        self.world.imu = None
+    world.imu, imu.sender = imu, "127.0.0.1"
+    imu.begin()
+    return imu
 
 
 class NoSignals(Signals):
@@ -506,11 +499,11 @@ def played_in(world: World):
                 clock = Clock(world, sleeps=not name.startswith("rig_workbench"))
                 stack.enter_context(mock.patch.object(module, "time", clock))
         wire = type("ThisWire", (FuzzWire,), {"world": world})
-        receiver = type("ThisReceiver", (FuzzReceiver,), {"world": world})
         verify_s, stand_s, too_fast = harness.AS_OF_A_DEVICE
         for place, name, value in (
             (bus, "Wire", wire),
-            (phones, "Receiver", receiver),
+            (phones.Imu, "open", lambda imu: opened_in(world, imu)),
+            (phones.Imu, "close", lambda imu: setattr(world, "imu", None)),
             (stop, "VERIFY_S", verify_s),
             (stop, "stand_s", stand_s),
             (motion, "TOO_FAST", too_fast),
