@@ -23,18 +23,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return stopping.main(argv[1:])
     from jaxcal.arguments import values_of
     from jaxcal.files import require_kept
+    from rig import faults
     from rig.commands import make_parser, resolved
-    from rig.faults import (
-        EXIT_BAD_INPUT,
-        EXIT_FAULT,
-        EXIT_INTERRUPTED,
-        JournalError,
-        told,
-    )
     from rig.parts import require
 
     argv, notes = resolved(argv)
-    command, code = argv[0] if argv else None, EXIT_BAD_INPUT
+    command, code = argv[0] if argv else None, faults.EXIT_BAD_INPUT
     try:
         for note in notes:
             print(f"jaxcal-rig: {note}", file=sys.stderr)
@@ -44,15 +38,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         code = args.function(**values_of(args))
         return code
     except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+        return faults.EXIT_INTERRUPTED
     except BrokenPipeError:
         return 141  # the reader of our output went away, as `| head` does
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         with contextlib.suppress(OSError, UnicodeError):  # the exit code says it too
-            print(f"jaxcal-rig: {told(error)}", file=sys.stderr)
-        if isinstance(error, JournalError) and command == "resume":
-            return EXIT_BAD_INPUT
-        return EXIT_FAULT if isinstance(error, RuntimeError) else code
+            print(f"jaxcal-rig: {faults.told(error)}", file=sys.stderr)
+        if isinstance(error, faults.JournalError) and command == "resume":
+            return faults.EXIT_BAD_INPUT
+        return faults.EXIT_FAULT if isinstance(error, RuntimeError) else code
 
 
 if __name__ == "__main__":

@@ -3,13 +3,8 @@
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    ValidationInfo,
-    WithJsonSchema,
-    model_validator,
-)
+import pydantic
+from pydantic import AfterValidator, BeforeValidator, ValidationInfo
 
 from rig.config.maps import DriveMap, Units, load_map
 from rig.config.schema import Section, advanced, key
@@ -105,7 +100,7 @@ class Axis(Scale):
     )
     unit: int = key("Modbus unit id", ..., 1, 247)
     map: Annotated[
-        DriveMap, BeforeValidator(_map), WithJsonSchema({"type": "string"})
+        DriveMap, BeforeValidator(_map), pydantic.WithJsonSchema({"type": "string"})
     ] = key("map of its drive: a name, or a .toml file relative to this one")
     min_deg: JointAngle = key("soft limit", ..., -10_000, 10_000)
     max_deg: JointAngle = key("soft limit", ..., -10_000, 10_000)
@@ -117,7 +112,7 @@ class Axis(Scale):
     )  # fmt: skip
     range_deg: Range | None = advanced("of the candidates; absent: the limits", None)
 
-    @model_validator(mode="before")
+    @pydantic.model_validator(mode="before")
     @classmethod
     def _in_millimetres(cls, data: Any) -> Any:
         if not isinstance(data, dict) or data.get("kind") != "translation":

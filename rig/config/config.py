@@ -8,18 +8,9 @@ import tomllib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+from rig.config import settings
 from rig.config.axis import AXIS_NAMES, DEFAULT_ROTATES, MOST_AXES, Axis, Pulses, Scale
 from rig.config.schema import ConfigError, Section, key, parse, read_text
-from rig.config.settings import (
-    BusSettings,
-    ImuSettings,
-    MechanismSettings,
-    ModelSettings,
-    MotionSettings,
-    ReadingsSettings,
-    SessionSettings,
-    SettleSettings,
-)
 from rig.stop_config import rows_of
 
 if TYPE_CHECKING:
@@ -106,15 +97,15 @@ def _digest(register_map: str, names: tuple[str, ...]) -> str:
 class RigConfig(Section):
     """A whole, valid configuration."""
 
-    bus: BusSettings
+    bus: settings.BusSettings
     axes: tuple[Axis, ...]
-    imu: ImuSettings | None = None  # the phone, or
-    readings: ReadingsSettings | None = None  # numbers
-    model: ModelSettings | None = None  # else it is affine
-    mechanism: MechanismSettings = MechanismSettings()
-    settle: SettleSettings = SettleSettings()
-    motion: MotionSettings = MotionSettings()
-    session: SessionSettings = SessionSettings()
+    imu: settings.ImuSettings | None = None  # the phone, or
+    readings: settings.ReadingsSettings | None = None  # numbers
+    model: settings.ModelSettings | None = None  # else it is affine
+    mechanism: settings.MechanismSettings = settings.MechanismSettings()
+    settle: settings.SettleSettings = settings.SettleSettings()
+    motion: settings.MotionSettings = settings.MotionSettings()
+    session: settings.SessionSettings = settings.SessionSettings()
     output: str = key("every run makes a folder in this folder", "runs")
     device: str = key("how it was commissioned, relative to this file", "device.json")
 
@@ -156,14 +147,14 @@ class RigConfig(Section):
         return self.readings.unit if self.readings else "deg"
 
     @property
-    def source(self) -> ImuSettings | ReadingsSettings:
+    def source(self) -> settings.ImuSettings | settings.ReadingsSettings:
         """The phone, or the sensor."""
         found = self.readings or self.imu
         assert found is not None  # a rule
         return found
 
     @property
-    def phone(self) -> ImuSettings:
+    def phone(self) -> settings.ImuSettings:
         """The phone, of what is asked only where there is one."""
         assert self.imu is not None
         return self.imu
@@ -384,7 +375,7 @@ class RigConfig(Section):
             limits = f"[{axis.min_deg}, {axis.max_deg}]"
             yield f"{span}: {ends} exceeds the axis's limits {limits}"
 
-    def _rules_of_model(self, model: ModelSettings) -> Iterator[str]:
+    def _rules_of_model(self, model: settings.ModelSettings) -> Iterator[str]:
         if self.session.k is None:
             yield "session.k: missing; with a [model] give how many postures to measure"
         if not model.urdf:

@@ -15,25 +15,18 @@ import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    PrivateAttr,
-    ValidationError,
-    model_validator,
-)
+import pydantic
 from pydantic_core import PydanticCustomError
 
 
-class Section(BaseModel):
+class Section(pydantic.BaseModel):
     """A table of a file: frozen, unknown keys are faults, no silent conversions."""
 
-    model_config = ConfigDict(
+    model_config = pydantic.ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False
     )
-    _text: str = PrivateAttr("")
-    _folder: pathlib.Path = PrivateAttr(pathlib.Path())
+    _text: str = pydantic.PrivateAttr("")
+    _folder: pathlib.Path = pydantic.PrivateAttr(pathlib.Path())
 
     @property
     def text(self) -> str:
@@ -49,7 +42,7 @@ class Section(BaseModel):
         """``key: fault`` of every rule about more than one key that is not kept."""
         return iter(())
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _keep_the_rules(self) -> Section:
         if faults := list(self.broken_rules()):
             raise PydanticCustomError("rules", "{faults}", {"faults": faults})
@@ -75,7 +68,7 @@ def key(
     else:
         more["default"] = default
     more["json_schema_extra"] = extra or None
-    return Field(description=about, ge=low, le=high, **more)
+    return pydantic.Field(description=about, ge=low, le=high, **more)
 
 
 def advanced(*args: Any, **more: Any) -> Any:
@@ -124,7 +117,7 @@ def parse(
         # Of JSON pydantic takes lists for tuples; nothing else is converted.
         plain = json.dumps(data, default=lambda date: [str(date)])  # no key takes one
         result = model.model_validate_json(plain, context=context)
-    except ValidationError as error:
+    except pydantic.ValidationError as error:
         schema = model.model_json_schema()
         listed = error.errors(include_url=False)
         faults = [text for e in listed for text in _texts(e, data, schema)] + faults
