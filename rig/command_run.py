@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import pathlib
+import threading
 from collections.abc import Callable, Iterable, Iterator
 
 from rig.config import RigConfig
@@ -11,9 +12,12 @@ from rig.config.axis import Pulses
 from rig.core.device import Device
 from rig.core.record_check import ZeroRecord
 from rig.core.session import SessionRun, open_device, take_zero
-from rig.faults import EXIT_FAULT, JournalError, PlanOnly, Refused, ending
+from rig.faults import EXIT_FAULT, JournalError, Refused, ending
 from rig.journal.device import DeviceRecord
 from rig.journal.run_folder import Record
+from rig.outputs.messages import event_lines, numbers
+from rig.outputs.run_state import RunState
+from rig.outputs.telemetry import telemetry
 from rig.parts import model_of
 from rig.signals import Signals
 
@@ -23,6 +27,8 @@ class Run(SessionRun):
 
     signals: Signals
     again = ""  # the command of a run that is not resumed, but begun again
+    kept_zero: ZeroRecord | None = None  # that the zero posture must be
+    zero_at: Pulses | None = None  # where it is taken; None: where the device stands
 
     def __init__(
         self,
@@ -34,18 +40,12 @@ class Run(SessionRun):
         record: DeviceRecord,
         start: Record | None = None,
         reset_alarms: bool = False,
-        zero_at: Pulses | None = None,
-        kept_zero: ZeroRecord | None = None,
-        dry_run: bool = False,
         signals: Signals | None = None,
     ) -> None:
         self._say = say
         self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
         self.beside = []
         self.record = record
-        self.zero_at = zero_at
-        self.kept_zero = kept_zero
-        self.dry_run = dry_run
         self.reset_alarms = reset_alarms
         self.model = model_of(config)  # None: affine
         self.predict = None if self.model is None else self.model.predict
@@ -80,9 +80,7 @@ class Run(SessionRun):
 
     @contextlib.contextmanager
     def device(self) -> Iterator[Device]:
-        """The device, armed and its zero taken; PlanOnly of a dry run, or Refused."""
-        if self.dry_run:
-            raise PlanOnly
+        """The device, armed and its zero taken, or Refused."""
         if text := self.record.missing(self.config):
             raise Refused(text)
         with self.armed() as device:
@@ -100,6 +98,31 @@ class Run(SessionRun):
         return f"{lack}. Then {resume}" if lack else resume
 
 
+def listen(run: Run) -> None:
+    """Print what happens in a run; write what phone and drives say to its files."""
+    state = RunState()
+    for record in run.journal.records:
+        state.apply(record)
+
+    def hear(record: Record) -> None:
+        state.apply(record)
+        lines = event_lines(record)
+        if record["event"] == "posture":
+            remaining = f", about {state.left_s():.0f} s left" if state.left_s() else ""
+            lines = [
+                f"  [{len(state.done):>3}/{state.planned}] {record['name']:<12} "
+                f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
+                f"y [{numbers(record['measured_deg'], 8, 3)}]{remaining}"
+            ]
+        if threading.current_thread() is threading.main_thread():
+            run.say(*lines)
+        elif lines:  # a terminal held by Ctrl-S must not hold the phone's thread too
+            threading.Thread(target=run.say, args=lines, daemon=True).start()
+
+    run.listeners.append(hear)
+    run.beside.append(telemetry)
+
+
 def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
     """Run a procedure, and say how it ended; returns the exit code.
 
@@ -112,8 +135,6 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
         except BaseException as error:
             run.signals.ending = True
             code, event, reason = ending(error, run.folder)
-            if isinstance(error, PlanOnly):
-                run.say("dry run: nothing was sent to the bus")
             if event == "refused" and len(run.journal.events("command")) > moved:
                 code, event = EXIT_FAULT, "fault"
         run.signals.ending = True

@@ -59,10 +59,6 @@ class PauseRequested(BaseException):
     """First Ctrl-C: the posture in progress was finished, the run can be resumed."""
 
 
-class PlanOnly(BaseException):
-    """A dry run has come to the point where it would move."""
-
-
 def told(error: BaseException) -> str:
     """What went wrong, and what to do."""
     return ". ".join(filter(None, (str(error), getattr(error, "advice", ""))))
@@ -71,8 +67,6 @@ def told(error: BaseException) -> str:
 def ending(error: BaseException, folder: pathlib.Path) -> tuple[int, str, str]:
     """Exit code, event and reason of a session in a folder that an error ended."""
     match error:
-        case PlanOnly():
-            return EXIT_OK, "end", ""
         case PauseRequested():
             return EXIT_PAUSED, "paused", str(error)
         case StopRequested():

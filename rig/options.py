@@ -103,7 +103,6 @@ class Session(DeviceOptions):
     """How a session is begun and shown."""
 
     out: Annotated[Path, "folder in which the run's folder is made"] | None = None
-    dry_run: Annotated[bool, "plan; open no port"] = False
     arm: Annotated[bool, "arm without prompting"] = False
     reset_alarms: Annotated[bool, "reset alarms of the drives before arming"] = False
     zero: Annotated[bool, "confirm that the device is in its zero posture"] = False

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rig import pages
-from rig.command_run import Run, run_safely
+from rig.command_run import Run, listen, run_safely
 from rig.config import RigConfig, load_config, parse_config
 from rig.core.record_check import ZeroRecord
 from rig.faults import JournalError, Refused
@@ -17,7 +17,6 @@ from rig.journal.device import STOP_PROVED, DeviceRecord
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import JOURNAL, SCHEMA, Record, new_run_folder, read_journal
 from rig.options import Session
-from rig.outputs.console import listen
 from rig.procedures import calibrate, verify
 from rig.prove import steps
 
@@ -44,10 +43,9 @@ def run_session(
             simulator = options.simulator(config, start["simulated"])
             config = stack.enter_context(simulator).start()
         lock, record = BusLock(config.bus), DeviceRecord.load(config.device_path)
-        if not options.dry_run:
-            stack.enter_context(lock.acquire(command))
-            if real and (lack := record.missing(config)):
-                raise Refused(lack)
+        stack.enter_context(lock.acquire(command))
+        if real and (lack := record.missing(config)):
+            raise Refused(lack)
         if folder is None:
             folder = new_run_folder(
                 options.out or pathlib.Path(config.output), start["mode"]
@@ -64,11 +62,10 @@ def run_session(
             start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
             reset_alarms=options.reset_alarms,
             record=record,
-            # With --zero the operator put the device into its zero posture.
-            zero_at=kept_zero.pulses if kept_zero and not options.zero else None,
-            kept_zero=kept_zero,
-            dry_run=options.dry_run,
         )
+        run.kept_zero = kept_zero
+        if kept_zero and not options.zero:  # else the operator put the device there
+            run.zero_at = kept_zero.pulses
         listen(run)
         run.confirm = functools.partial(_confirm, options, doubts)
         if simulator is not None:

@@ -42,13 +42,6 @@ def _comm_restored(record: Record) -> str:
     )
 
 
-def _shown(record: Record) -> str:
-    return (
-        f"  {record['axis']}: measured/commanded {record['ratio']:.3f}, at `axes` "
-        f"{record['before']:.3f}"
-    )
-
-
 def _stayed(record: Record) -> str:
     lines = [f"WARNING: {text}, and was stopped again" for text in record["went_on"]]
     units = [f"  {UnitStop(**unit)}" for unit in record["units"]]
@@ -93,7 +86,7 @@ SENTENCES: dict[str, str | Callable[[Record], str]] = {
     "comm_restored": _comm_restored,
     "stop": _stop,
     "stayed": _stayed,
-    "shown": _shown,
+    "shown": "  {axis}: measured/commanded {ratio:.3f}, at `axes` {before:.3f}",
 }
 
 
@@ -120,8 +113,6 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
         lines, use = _affine_lines(summary, outputs), "`jaxcal-rig export` writes it"
     if drift:
         lines.append(f"drift: {drift_text(drift, outputs, summary['unit'])}")
-    if warning := summary.get("orders", {}).get("warning"):
-        lines.append(f"WARNING: {warning}")
     if reasons := recalibrate(summary, limit_deg):
         verdict = (
             f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration; next: "
@@ -150,13 +141,8 @@ def _affine_lines(summary: dict[str, Any], outputs: Sequence[str]) -> list[str]:
         f"  noise of one posture {', '.join((f'{n} {v:.4f}' for n, v in std))} "
         f"{unit}, from {summary['basis']} ({summary['dof']} degrees of freedom each)"
     )
-    if "after" in summary:
+    if "prediction" in summary:
         lines.append(f"held-out {error_text(summary, unit)}")
-    elif errors := summary.get("prediction"):  # a refit: nothing was compensated by it
-        lines.append(
-            f"held-out postures: prediction error {errors['rms']:.4f} {unit} rms (max "
-            f"{errors['max']:.4f})"
-        )
     return lines
 
 
@@ -171,30 +157,23 @@ def _model_lines(summary: dict[str, Any]) -> tuple[list[str], str]:
             f"{parameter['designed']:.5g})"
         )
     if "prediction" in summary:
-        lines.append(f"held-out {prediction_text(summary, unit)}")
+        lines.append(f"held-out {error_text(summary, unit)}")
     lines += [f"  note: {reason}" for reason in summary["fit"]["reasons"]]
     if summary.get("urdf"):
         return lines, f"{summary['urdf']} in the run's folder"
     return lines, "calibration.json (jaxcal command, jaxcal predict)"
 
 
-def prediction_text(errors: dict[str, Any], unit: str) -> str:
-    """Errors of predictions at held-out postures, as designed and calibrated."""
-    text = "prediction error before calibration {}, after {}"
-    return _compared(text, errors["before"], errors["prediction"], unit)
-
-
 def error_text(errors: dict[str, Any], unit: str = "deg") -> str:
-    """Errors at held-out postures, raw and compensated."""
-    text = "error before {}, after compensation {}"
-    return _compared(text, errors["before"], errors["after"], unit)
-
-
-def _compared(text: str, before: Record, after: Record, unit: str) -> str:
-    first, second = (f"(max {errors['max']:.4f})" for errors in (before, after))
-    return text.format(
-        f"{before['rms']:.4f} {unit} rms {first}", f"{after['rms']:.4f} {second}"
+    """Errors at held-out targets, raw and compensated; else of the predictions."""
+    text, after = "prediction error before calibration {}, after {}", "prediction"
+    if "after" in errors:
+        text, after = "error before {}, after compensation {}", "after"
+    first, second = (
+        f"{errors[name]['rms']:.4f}{of} (max {errors[name]['max']:.4f})"
+        for name, of in (("before", f" {unit} rms"), (after, ""))
     )
+    return text.format(first, second)
 
 
 def held_out(summary: dict[str, Any]) -> tuple[str, float]:

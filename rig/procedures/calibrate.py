@@ -15,15 +15,14 @@ from rig.core.session import visit
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
 from rig.identification.conclusion import check_matrix, conclude, identify_affine, pairs
 from rig.journal.device import SIGN_CHECKED
-from rig.outputs.console import plan_lines
-from rig.outputs.messages import numbers, save_result
+from rig.outputs.messages import save_result
 from rig.outputs.run_state import roles_of
 from rig.procedures.plan import (
     Choice,
     choose,
     draw,
-    draw_candidates,
     draw_held_out,
+    plan_lines,
     travel_order,
 )
 from rig.readings.attitude import Array
@@ -66,7 +65,7 @@ def _plan(run: Run) -> tuple[Array, Choice]:
             f"planning: {config.k} of {session.candidates} candidates by "
             f"{config.method}, and the proven optimum; nothing moves yet"
         )
-        candidates = draw_candidates(config)
+        candidates = draw(config, session.candidates)
         choice = choose(config, config.to_deg(candidates))
         choice = _ordered(run, choice, candidates, config.to_deg(run.zero_pulses))
         chosen = dataclasses.asdict(choice)
@@ -74,7 +73,7 @@ def _plan(run: Run) -> tuple[Array, Choice]:
 
     record = run.remember("plan", make)
     candidates, choice = np.array(record["candidates"]), Choice(**record["choice"])
-    run.say(*plan_lines(config, choice, candidates, config.to_deg(run.zero_pulses)))
+    run.say(*plan_lines(config, choice, candidates))
     return candidates, choice
 
 
@@ -190,15 +189,12 @@ def collect(run: Run, count: int) -> int:
     def make() -> dict[str, Any]:
         return {"pulses": draw(config, count, 2).tolist()}
 
-    targets = run.remember("collection", make)["pulses"]
-    if run.dry_run:
-        for number, target in enumerate(targets):
-            run.say(f"  {number:>5}   {numbers(config.to_deg(target))}   {target}")
-    names = [f"collect:{number}" for number in range(len(targets))]
-    if run.lacks([*names, END]):
+    drawn = run.remember("collection", make)["pulses"]
+    targets = {f"collect:{number}": pulses for number, pulses in enumerate(drawn)}
+    if run.lacks([*targets, END]):
         with run.device() as device:
-            for name, target in zip(names, targets, strict=True):
-                visit(device, Posture(name, tuple(target)), role="collect")
+            for name, pulses in targets.items():
+                visit(device, Posture(name, tuple(pulses)), role="collect")
             visit(device, Posture(END, run.zero_pulses), role="reference")
             run.emit("phase", phase="saving")
     closing = run.postures().get(END)

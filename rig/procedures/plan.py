@@ -14,12 +14,13 @@ from jaxcal.designs.travel import Motion, fastest_tour, travel_times
 from jaxcal.models.affine import Affine
 from rig.config import RigConfig
 from rig.config.axis import Pulses
+from rig.outputs.messages import choice_text, numbers
 from rig.parts import model_of
 from rig.readings.attitude import Array
 
 EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
 REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed
-MOST_IMPROVED = 200  # postures whose tour is searched; beyond, nearest neighbours
+MOST_IMPROVED = 200  # postures whose tour is searched
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,11 +43,6 @@ def draw(config: RigConfig, count: int, *seed: int) -> Array:
     rng = np.random.default_rng([config.session.seed, *seed])
     angles = rng.uniform(low, high, size=(count, len(low)))
     return np.array([config.to_pulses(angle) for angle in angles])
-
-
-def draw_candidates(config: RigConfig) -> Array:
-    """(M, n) int pulses from which the postures are chosen."""
-    return draw(config, config.session.candidates)
 
 
 def choose(
@@ -124,26 +120,37 @@ def _by_its_method(
     return chosen, getattr(chosen, "reason", "")
 
 
+def plan_lines(config: RigConfig, choice: Choice, pulses: Array) -> list[str]:
+    """What will be done: a choice, in the order of visits, of (M, n) ``pulses``."""
+    session = config.session
+    text = choice_text(vars(choice))
+    lines = [f"{config.k} of {session.candidates} candidates by {text}"]
+    if choice.note:
+        lines.append(f"  note: {choice.note}")
+    head = f"{config.axis_unit} ({' '.join(config.axis_names)})"
+    lines.append(f"  order   candidate   {head:<{10 * len(config.axes)}}  pulses")
+    visited = pulses[list(choice.indices)]
+    degrees = config.to_deg(visited)
+    for number, index in enumerate(choice.indices):
+        angles, sent = numbers(degrees[number]), visited[number].tolist()
+        lines.append(f"  {number + 1:>5}   {index:>9}   {angles}   {sent}")
+    both = ", before and after" if config.model is None else ""
+    lines.append(f"  with {session.verify_postures} held-out postures{both}")
+    return lines
+
+
 def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:
     """Order of visits of (N, n) points of least travel time from (n,), ending anywhere.
 
-    The slowest axis sets the time. Optimal for N up to 12; above 200 nearest first.
+    The slowest axis sets the time. Optimal for N up to 12; above 200 as they are given.
     """
-    if not len(points_deg):
-        return []
+    if not 0 < len(points_deg) <= MOST_IMPROVED:
+        return [*range(len(points_deg))]
     speed = tuple(axis.speed_deg_s for axis in config.axes)
     motion = Motion(speed, tuple(axis.accel_deg_s2 for axis in config.axes))
     here = travel_times([start_deg], points_deg, motion)[0]
-    if len(points_deg) <= MOST_IMPROVED:
-        times = travel_times(points_deg, points_deg, motion)
-        return [int(i) for i in fastest_tour(times, here)[0]]
-    order: list[int] = []
-    unvisited = np.arange(len(points_deg))
-    while len(unvisited):
-        order.append(int(unvisited[here[unvisited].argmin()]))
-        unvisited = unvisited[unvisited != order[-1]]
-        here = travel_times(points_deg[order[-1:]], points_deg, motion)[0]
-    return order
+    times = travel_times(points_deg, points_deg, motion)
+    return [int(i) for i in fastest_tour(times, here)[0]]
 
 
 def draw_held_out(

@@ -10,21 +10,18 @@ import numpy as np
 
 from rig.command_run import Run
 from rig.config import RigConfig
-from rig.config.axis import Pulses
 from rig.config.config import differences
 from rig.core.device import Posture
 from rig.core.record_check import ZeroRecord
 from rig.core.session import visit
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
-from rig.identification.conclusion import held_out_errors, pairs
-from rig.outputs.messages import error_text, numbers, prediction_text
+from rig.identification.conclusion import held_out_errors
+from rig.outputs.messages import error_text, held_out
 from rig.parts import model_of
 from rig.procedures.calibrate import pair_targets, visit_pairs
 from rig.procedures.plan import draw_held_out
 from rig.readings.attitude import Array
 from rig.readings.geometry import Frame, geometry_of
-
-_OFFERED = 10  # targets to choose each posture of a check from
 
 
 def load_calibration(
@@ -79,16 +76,13 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     """Fresh held-out postures against a saved calibration: is it still true?"""
     config = run.config
     held = run.remember(
-        "held_out", lambda: {"pairs": telling(config, calibration, count)}
+        "held_out", lambda: {"pairs": draw_held_out(config, calibration, count)}
     )["pairs"]
     if not held:
         raise Refused(
             "no target in session.*_range_deg can be reached with this calibration. "
             "Widen the ranges, or calibrate again"
         )
-    if run.dry_run:
-        for raw, command in ((target[0], target[-1]) for target in held):
-            run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
     if run.lacks(pair_targets(held)):
         with run.device() as device:
             visit_pairs(run, device, held)
@@ -97,37 +91,20 @@ def verify(run: Run, calibration: Any, count: int) -> int:
         records = [r for r in run.postures().values() if r["role"] == "held"]
         errors = run.model.held_out_errors(config, calibration, records)
     else:
-        records, errors = held_out_errors(config, held, run.postures(), calibration)
+        _, errors = held_out_errors(config, held, run.postures(), calibration)
     if not errors:
         raise Refused(
             "no held-out posture could be reached. Narrow session.*_range_deg to what "
             "the device reaches"
         )
     limit = config.session.verify_limit_deg
-    worst = "after" if run.model is None else "prediction"
-    words = error_text if run.model is None else prediction_text
-    again = errors[worst]["max"] > limit
+    again = held_out(errors)[1] > limit
     run.save_pairs()
     run.save_summary({**errors, "limit_deg": limit, "recalibrate": again})
-    run.say(f"{words(errors, config.output_unit)}, limit {limit:g}")
-    if calibration.noise_std is not None:
-        rows = run.model.outputs(config, records) if run.model else pairs(records)
-        told = calibration.check(*rows, tolerance=limit)
-        run.say(f"the check would detect a drift of {limit:g} (power {told.power:.0%})")
+    run.say(f"{error_text(errors, config.output_unit)}, limit {limit:g}")
     over = "RECALIBRATE: over session.verify_limit_deg. Run `jaxcal-rig calibrate`"
     run.say(over if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK
-
-
-def telling(
-    config: RigConfig, calibration: Any, count: int
-) -> list[tuple[Pulses, ...]]:
-    """Held-out targets, of many, that show best that the calibration is wrong."""
-    offered = draw_held_out(config, calibration, _OFFERED * count)
-    if calibration.noise_std is None or len(offered) <= count:
-        return offered[:count]
-    at = np.array([config.to_deg(target[-1]) for target in offered])
-    return [offered[i] for i in calibration.verification(at, count)]
 
 
 def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:

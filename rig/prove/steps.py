@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from jaxcal.files import write_text
-from rig.command_run import Run, run_safely
+from rig.command_run import Run, listen, run_safely
 from rig.config import ConfigError, RigConfig, parse_config
 from rig.config.schema import read_text
 from rig.core import session
@@ -27,7 +27,6 @@ from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.journal.device import HOMED, IDENTIFIED, STATES, DeviceRecord
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import Record, new_run_folder
-from rig.outputs.console import listen
 from rig.parts import PLACES
 from rig.prove.axis_check import Change
 from rig.prove.axis_moves import check_axes

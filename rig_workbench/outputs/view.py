@@ -8,7 +8,7 @@ from typing import Any
 
 from rig.core.stop import UnitStop
 from rig.faults import EXIT_RECALIBRATE
-from rig.outputs.messages import error_text, prediction_text, summary_lines
+from rig.outputs.messages import error_text, summary_lines
 from rig.outputs.run_state import ACTIVE, SESSIONS, PostureState, Record, RunState
 from rig.parts import PLACES
 
@@ -147,8 +147,6 @@ def verdict(state: RunState, summary: dict[str, Any]) -> list[str]:
     limit = state.setting("session", "verify_limit_deg", math.nan)
     if "A" in summary or "parameters" in summary:
         return summary_lines(summary, limit)
-    if "before" in summary and "after" not in summary:
-        return [f"{prediction_text(summary, state.unit)}, limit {limit:g}"]
     if "before" in summary:
         return [f"{error_text(summary, state.unit)}, limit {limit:g}"]
     if state.ended is None or state.ended["event"] != "end":

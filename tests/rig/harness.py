@@ -17,7 +17,7 @@ from unittest import mock
 
 import numpy as np
 
-from rig.command_run import Run, run_safely
+from rig.command_run import Run, listen, run_safely
 from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
 from rig.config.maps import RegisterMap, available_maps, load_map
@@ -35,7 +35,6 @@ from rig.journal.device import (
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import JOURNAL, read_journal
 from rig.outputs import messages
-from rig.outputs.console import listen
 from rig.procedures.calibrate import calibrate
 from rig.signals import Signals
 from rig_workbench import simulator as simulators

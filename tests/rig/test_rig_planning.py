@@ -17,7 +17,7 @@ from rig.config import example_text, parse_config
 from rig.identification.conclusion import held_out_errors
 from rig.procedures.plan import (
     choose,
-    draw_candidates,
+    draw,
     draw_held_out,
     travel_order,
 )
@@ -28,7 +28,7 @@ from rig.procedures.verify import _command
 def test_the_shipped_policy_makes_the_default_choice():
     """Not its stand-in: a session without a configuration selects with the policy."""
     config = parse_config(example_text("simulate"))
-    candidates = config.to_deg(draw_candidates(config))
+    candidates = config.to_deg(draw(config, config.session.candidates))
     choice = choose(config, candidates)
     assert (choice.method, choice.note, choice.proven) == ("policy", "", True)
     alone = jaxcal.select(candidates, 4, method="policy")
@@ -40,7 +40,7 @@ def test_without_a_checkpoint_the_choice_is_the_exact_optimum(tmp_path, monkeypa
     from jaxcal.learning.runtime import weights
 
     config = parse_config(example_text("simulate"))
-    candidates = config.to_deg(draw_candidates(config))
+    candidates = config.to_deg(draw(config, config.session.candidates))
     monkeypatch.setattr(weights, "shipped", lambda: tmp_path / "none.npz")
     choice = choose(config, candidates)
     assert (choice.method, choice.efficiency) == ("exact", 1.0)
@@ -49,7 +49,7 @@ def test_without_a_checkpoint_the_choice_is_the_exact_optimum(tmp_path, monkeypa
 
 def test_the_policys_place_is_taken_by_exact_when_it_is_missing_or_poor(monkeypatch):
     config = parse_config(fast_text(session=""))
-    candidates = config.to_deg(draw_candidates(config))
+    candidates = config.to_deg(draw(config, config.session.candidates))
     real = jaxcal.select
 
     def poor(points, k, method="policy", **options):
@@ -80,7 +80,7 @@ def test_the_policys_place_is_taken_by_exact_when_it_is_missing_or_poor(monkeypa
 def test_every_method_of_a_session_makes_a_choice(method):
     text = f'\n[session]\nmethod = "{method}"\nmin_efficiency = 0.01\nseed = 3\n'
     config = parse_config(fast_text(session=text))
-    degrees = config.to_deg(draw_candidates(config))
+    degrees = config.to_deg(draw(config, config.session.candidates))
     best = jaxcal.select(degrees, 4, method="exact")
     choice = choose(config, degrees)
     assert choice.method == ("exact" if method == "auto" else method)
@@ -94,7 +94,7 @@ def test_every_method_of_a_session_makes_a_choice(method):
 def test_auto_answers_within_the_efficiency_asked_for(least):
     text = f'\n[session]\nmethod = "auto"\nmin_efficiency = {least}\n'
     config = parse_config(fast_text(session=text))
-    degrees = config.to_deg(draw_candidates(config))
+    degrees = config.to_deg(draw(config, config.session.candidates))
     best = jaxcal.select(degrees, 4, method="exact")
     choice = choose(config, degrees)
     assert choice.efficiency >= least - 1e-9
@@ -129,7 +129,7 @@ def test_travel_order_takes_the_least_time(rng):
     best = min(seconds(o, few) for o in itertools.permutations(range(5)))
     found = travel_order(config, few, np.zeros(3))
     assert seconds(found, few) == pytest.approx(best)
-    for count in (14, 201):  # above 12 improved, above 200 nearest neighbours
+    for count in (14, 201):  # above 12 improved, above 200 as given
         many = travel_order(config, rng.uniform(-20, 20, (count, 3)), np.zeros(3))
         assert sorted(many) == list(range(count))
     assert travel_order(config, np.empty((0, 3)), np.zeros(3)) == []

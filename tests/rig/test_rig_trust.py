@@ -63,8 +63,8 @@ def run_verify(config, calibration, folder, sim, record=None, here=False):
     run = make_run(
         config, folder, "verify", said.append,
         record=record or commissioned(config, folder),
-        zero_at=None if here else zero.pulses, kept_zero=zero,
     )  # fmt: skip
+    run.zero_at, run.kept_zero = None if here else zero.pulses, zero
     run.listeners.append(sim.answer)
     return run_safely(run, lambda r: verify(r, saved, 2)), said
 
