@@ -15,8 +15,8 @@ from rig.faults import MotionFault
 from rig.journal.run_folder import Record, measured_postures
 from rig.outputs.messages import recalibrate
 from rig.parts import model_of
-from rig.readings.attitude import ORDERS, Array, frame_at
-from rig.readings.geometry import Attitudes, Geometry, geometry_of
+from rig.readings.attitude import Array
+from rig.readings.geometry import Geometry, geometry_of
 
 USUAL = (1 / 3, 3.0)  # degrees of a joint for one commanded; outside it is told
 SIGNIFICANT = 3.0  # standard deviations, of a drift
@@ -69,14 +69,6 @@ def identify_affine(
     return dataclasses.replace(fitted, joint_covariance=covariance)
 
 
-def mispaired(config: RigConfig, records: list[Record]) -> list[str]:
-    """How readings and postures were mispaired, in the order in which they were
-    measured; nothing where they belong together."""
-    in_order = sorted(records, key=lambda record: record["seq"])
-    found = identify_affine(config, in_order).mispairing
-    return [found.reason] if found else []
-
-
 def uncertainty(
     chosen: list[Record], held_out: list[Record], zero_share: float
 ) -> dict[str, Any]:
@@ -116,7 +108,6 @@ def uncertainty(
 def spread(off: Array) -> dict[str, Any]:
     """(N, m) errors, and how large they are."""
     return {
-        "rms_axis": np.sqrt((off**2).mean(axis=0)).tolist(),
         "rms": float(np.sqrt((off**2).mean())),
         "max": float(np.abs(off).max()),
         "each": off.tolist(),
@@ -253,10 +244,11 @@ def conclude(
     # The noise is that which the held-out postures show.
     zero_share = chosen[0]["samples"] / zero["samples"]
     limits = uncertainty(chosen, held_out, zero_share)
-    reasons = [
-        *mispaired(config, [*chosen, *held_out]),
-        *recalibrate({**errors, "drift": drift}, config.session.verify_limit_deg),
-    ]
+    in_order = sorted([*chosen, *held_out], key=lambda record: record["seq"])
+    mispairing = identify_affine(config, in_order).mispairing
+    reasons = [mispairing.reason] if mispairing else []
+    limit = config.session.verify_limit_deg
+    reasons += recalibrate({**errors, "drift": drift}, limit)
     notes |= {
         "mechanism_order": config.mechanism.order,
         "noise_from": limits["basis"],
@@ -269,52 +261,8 @@ def conclude(
         "A": np.asarray(calibration.matrix).tolist(),
         "b": np.asarray(calibration.bias).tolist(),
         **limits,
-        "orders": order_residuals(config, zero, chosen + held_out),
         **errors,
     }
-
-
-def order_residuals(
-    config: RigConfig, zero: Record, records: list[Record]
-) -> dict[str, Any]:
-    """Residual of the linear fit under each of the six mechanism orders.
-
-    The right order leaves noise; a wrong one leaves degrees. Needs two postures more
-    than a fit does, which without them is exact under every order.
-
-    Returns:
-        rms (order to degrees), configured, warning (empty where all is well).
-    """
-    configured, dof = config.mechanism.order, len(records) - len(config.axes) - 1
-    if not isinstance(geometry_of(config), Attitudes):
-        return {"rms": {}, "configured": "", "warning": ""}
-    if dof < 2:
-        return {"rms": {}, "configured": configured, "warning": ""}
-    frame = frame_at(config, np.array(zero["attitude"]))
-    design = np.column_stack([pairs(records)[0], np.ones(len(records))])
-    across = np.eye(len(records)) - design @ np.linalg.pinv(design)
-    attitudes = np.array([r["attitude"] for r in records])
-    rms: dict[str, float] = {}
-    for order in ORDERS:
-        residual = across @ frame.angles(attitudes, order)
-        mean_square = (residual**2).sum() / (residual.shape[1] * dof)
-        rms[order] = float(np.sqrt(mean_square))
-    best = min(rms, key=lambda order: rms[order])
-    noise = float(np.mean([r["std_deg"] for r in records]))
-    warning = ""
-    if rms[configured] > max(2.0 * rms[best], 0.02):
-        warning = (
-            f"the order {best} leaves residuals of {rms[best]:.3f} deg, the configured "
-            f"order {configured} {rms[configured]:.3f} deg: check mechanism.order and "
-            "the phone's order"
-        )
-    elif rms[configured] > max(10.0 * noise, 0.1):
-        warning = (
-            f"the fit with the configured order {configured} leaves residuals of "
-            f"{rms[configured]:.3f} deg, far above the readings' scatter of "
-            f"{noise:.3f} deg: check [imu] order and signs, mounting, backlash"
-        )
-    return {"rms": rms, "configured": configured, "warning": warning}
 
 
 def check_matrix(config: RigConfig, matrix: ArrayLike) -> list[str]:

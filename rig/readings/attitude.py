@@ -9,11 +9,6 @@ order, and no other; a wrong order leaves degrees of error no calibration remove
 from __future__ import annotations
 
 import dataclasses
-import functools
-import itertools
-import time
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from rig.config.config import RigConfig
 
 Array = NDArray[np.float64]
-ORDERS = tuple("".join(order) for order in itertools.permutations("XYZ"))
 DIGITS = 8  # of a quaternion: 1e-6 degrees
 
 
@@ -35,30 +29,17 @@ class Reading:
 
 
 def euler_to_matrix(angles_deg: ArrayLike, order: str) -> Array:
-    """(..., 3, 3) of (..., 3) degrees in the sequence of ``order``, one of ORDERS;
-    written out, as its inverse: scipy's takes ten times as long for one attitude."""
-    i, j, k, sign = _sequence(order)
-    turns = np.radians(np.asarray(angles_deg, dtype=np.float64))
-    sine_a, sine_b, sine_c = np.moveaxis(sign * np.sin(turns), -1, 0)
-    cosine_a, cosine_b, cosine_c = np.moveaxis(np.cos(turns), -1, 0)
-    matrix = np.empty((*turns.shape, 3))
-    matrix[..., i, i] = cosine_b * cosine_c
-    matrix[..., i, j] = -cosine_b * sine_c
-    matrix[..., i, k] = sine_b
-    matrix[..., j, i] = cosine_a * sine_c + sine_a * sine_b * cosine_c
-    matrix[..., j, j] = cosine_a * cosine_c - sine_a * sine_b * sine_c
-    matrix[..., j, k] = -sine_a * cosine_b
-    matrix[..., k, i] = sine_a * sine_c - cosine_a * sine_b * cosine_c
-    matrix[..., k, j] = sine_a * cosine_c + cosine_a * sine_b * sine_c
-    matrix[..., k, k] = cosine_a * cosine_b
-    return matrix
+    """(..., 3, 3) of (..., 3) degrees in the sequence of ``order``, such as "ZYX"."""
+    return Rotation.from_euler(order, angles_deg, degrees=True).as_matrix()
 
 
 def matrix_to_euler(matrix: ArrayLike, order: str) -> Array:
     """(..., 3) degrees of rotations (..., 3, 3): the middle one lies in [-90, 90], the
     others in +-180. Where it is +-90 only the sum or the difference of the others is
-    determined, and any two that give it are returned."""
-    i, j, k, sign = _sequence(order)
+    determined, and any two that give it are returned. Written out: scipy's warns there,
+    and takes ten times as long for one attitude."""
+    i, j, k = ("XYZ".index(letter) for letter in order)
+    sign = 1 if (j - i) % 3 == 1 else -1  # whether the axes are right-handed
     turned = np.asarray(matrix, dtype=np.float64)
     first_row, column_i, column_j = turned[..., i, :], turned[..., i], turned[..., j]
     second = np.arctan2(
@@ -74,13 +55,6 @@ def matrix_to_euler(matrix: ArrayLike, order: str) -> Array:
     return np.degrees(sign * np.stack([first, second, third], axis=-1)) + 0.0  # no -0
 
 
-@functools.cache
-def _sequence(order: str) -> tuple[int, int, int, int]:
-    """Indices of the axes of an order, and 1 where they are right-handed, else -1."""
-    i, j, k = ("XYZ".index(letter) for letter in order)
-    return i, j, k, 1 if (j - i) % 3 == 1 else -1
-
-
 def angle_between_deg(first: ArrayLike, second: ArrayLike) -> float:
     """Angle in degrees of the rotation that takes one (3, 3) attitude to another."""
     turn = np.asarray(first).T @ np.asarray(second)  # for every reading: numpy is quick
@@ -88,11 +62,6 @@ def angle_between_deg(first: ArrayLike, second: ArrayLike) -> float:
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
     )
     return float(np.degrees(np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0))))
-
-
-def mean_rotation(matrices: ArrayLike) -> Array:
-    """Rotation nearest to all of (N, 3, 3), N >= 1; indifferent to any 0/360 wrap."""
-    return Rotation.from_matrix(matrices).mean().as_matrix()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,22 +78,11 @@ class AttitudeFrame:
     order: str  # axes of the mechanism from the base outwards
     letters: tuple[str, ...]  # axis letter of each joint that there is
 
-    def angles(self, matrix: ArrayLike, order: str | None = None) -> Array:
+    def angles(self, matrix: ArrayLike) -> Array:
         """(..., n) joint angles in degrees of phone attitudes (..., 3, 3)."""
-        order = order or self.order
         turned = self.zero.T @ np.asarray(matrix, dtype=np.float64)
-        sequence = matrix_to_euler(self.mounting @ turned @ self.mounting.T, order)
-        return sequence[..., [order.index(letter) for letter in self.letters]]
-
-
-def raw_fields(readings: Sequence[Reading]) -> dict[str, Any]:
-    """``quaternions`` (samples, 4), x y z w, and ``stamps`` (samples,), Unix time."""
-    turns = Rotation.from_matrix([reading.value for reading in readings])
-    clock = time.time() - time.monotonic()
-    return {
-        "quaternions": turns.as_quat(canonical=True).round(DIGITS).tolist(),
-        "stamps": [round(reading.time + clock, 4) for reading in readings],
-    }
+        sequence = matrix_to_euler(self.mounting @ turned @ self.mounting.T, self.order)
+        return sequence[..., [self.order.index(letter) for letter in self.letters]]
 
 
 def frame_at(config: RigConfig, zero: Array) -> AttitudeFrame:

@@ -8,6 +8,7 @@ and allowed where nothing is proved.
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,14 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from rig.config.config import RigConfig
 from rig.readings.attitude import (
+    DIGITS,
     Array,
     AttitudeFrame,
     Reading,
     angle_between_deg,
     euler_to_matrix,
     frame_at,
-    mean_rotation,
-    raw_fields,
 )
 
 RADIAN = 180.0 / np.pi  # a direction's length, so that a turn of it is in degrees
@@ -113,8 +113,6 @@ class Attitudes(Geometry):
         self._config = config
 
     apart = staticmethod(angle_between_deg)
-    mean = staticmethod(mean_rotation)  # type: ignore[assignment]  # has no self
-    raw = staticmethod(raw_fields)
 
     def too_far(self, way: float, most: float) -> str:
         return (
@@ -124,6 +122,10 @@ class Attitudes(Geometry):
 
     def way(self, first: Array, second: Array) -> Array:
         return Rotation.from_matrix(first.T @ second).as_rotvec(degrees=True)
+
+    def mean(self, readings: Sequence[Array]) -> Array:
+        """Rotation nearest to all of (N, 3, 3), N >= 1; indifferent to a 0/360 wrap."""
+        return Rotation.from_matrix(readings).mean().as_matrix()
 
     def frame(self, zero: Array) -> Frame:
         return frame_at(self._config, zero)
@@ -151,6 +153,15 @@ class Attitudes(Geometry):
 
     def outputs(self, reading: Array, measured: Array) -> Array:
         return measured
+
+    def raw(self, readings: Sequence[Reading]) -> dict[str, Any]:
+        """``quaternions`` (samples, 4), x y z w; Unix ``stamps`` (samples,)."""
+        turns = Rotation.from_matrix([reading.value for reading in readings])
+        clock = time.time() - time.monotonic()
+        return {
+            "quaternions": turns.as_quat(canonical=True).round(DIGITS).tolist(),
+            "stamps": [round(reading.time + clock, 4) for reading in readings],
+        }
 
     def drift(self, readings: Array, minutes: Array) -> Array:
         """Drift of the phone's world: a heading that drifts turns that."""

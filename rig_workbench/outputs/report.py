@@ -77,10 +77,6 @@ def _result(state: RunState, summary: Record) -> list[Section]:
         alt = f"held-out errors in {state.unit}, {' and '.join(errors)}"
         draw = functools.partial(draw_errors, names=outputs, unit=state.unit)
         parts.append(drawn(draw, errors, (9, 3.4), alt))
-    if rms := summary.get("orders", {}).get("rms"):
-        rows = [[order, f"{left:.4f}"] for order, left in rms.items()]
-        told = f"configured: {summary['orders']['configured']}"
-        parts.append(Table(["Euler order", "residual, degrees rms"], rows, told))
     sections = [Section("Result", parts)] if parts else []
     if changes := summary.get("changed"):
         rows = [[key, str(old), str(new)] for key, (old, new) in changes.items()]

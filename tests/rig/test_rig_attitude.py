@@ -1,17 +1,22 @@
 """Rotations: the six orders, Android's published formulas, and the zero reference."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
+from harness import fast_config
 from scipy.spatial.transform import Rotation
 
+from rig.config.settings import Order
 from rig.readings.attitude import (
-    ORDERS,
     AttitudeFrame,
     angle_between_deg,
     euler_to_matrix,
     matrix_to_euler,
-    mean_rotation,
 )
+from rig.readings.geometry import Attitudes
+
+ORDERS = get_args(Order)
 
 
 def elementary(letter, degrees):
@@ -81,7 +86,7 @@ def test_androids_legacy_orientation_is_zyx_with_all_signs_turned(rng):
 
 def test_mean_ignores_the_wrap_from_359_to_1():
     matrices = euler_to_matrix([[359.0, 0, 0], [1.0, 0, 0], [0.5, 0, 0]], "ZYX")
-    mean = matrix_to_euler(mean_rotation(matrices), "ZYX")
+    mean = matrix_to_euler(Attitudes(fast_config()).mean(matrices), "ZYX")
     assert abs(mean[0] - 0.5 / 3) < 1e-4
 
 

@@ -1,5 +1,7 @@
 """Intervals that keep their word, also under correlated noise; a zero that drifts."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from harness import fast_config
@@ -11,14 +13,13 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from rig.config import AXIS_NAMES
+from rig.config.settings import Order
 from rig.identification.conclusion import estimate_drift, uncertainty, without_drift
 from rig.outputs.messages import drift_text, recalibrate
 from rig.readings.attitude import (
-    ORDERS,
     AttitudeFrame,
     Reading,
     euler_to_matrix,
-    raw_fields,
 )
 from rig.readings.geometry import Attitudes
 from rig_workbench.refit import attitudes
@@ -136,7 +137,7 @@ def a_frame(order="ZXY", heading=170.0):
 
 
 @given(
-    st.sampled_from(ORDERS),
+    st.sampled_from(get_args(Order)),
     st.tuples(*[st.floats(-2, 2)] * 3).filter(lambda w: np.linalg.norm(w) > 0.1),
     st.tuples(*[st.floats(-20, 20)] * 3),
 )
@@ -194,6 +195,6 @@ def test_the_readings_of_a_record_come_back(rng):
     frame = a_frame()
     matrices = seen(frame, rng.normal([3, -5, 8], 0.1, (25, 3)))
     readings = [Reading(100.0 + 0.01 * i, m) for i, m in enumerate(matrices)]
-    kept = raw_fields(readings)
+    kept = reading(frame).raw(readings)
     np.testing.assert_allclose(attitudes(kept), matrices, atol=1e-7)
     np.testing.assert_allclose(np.diff(kept["stamps"]), 0.01, atol=2e-4)

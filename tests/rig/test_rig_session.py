@@ -32,10 +32,9 @@ from rig.__main__ import main
 from rig.command_run import run_safely
 from rig.config import parse_config
 from rig.faults import Refused
-from rig.identification.conclusion import order_residuals
 from rig.journal.run_folder import read_journal
 from rig.procedures.calibrate import calibrate, collect
-from rig.procedures.plan import choose, draw_candidates
+from rig.procedures.plan import choose, draw
 from rig_workbench.simulator import Truth
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
@@ -325,19 +324,6 @@ def test_collect_records_a_dataset_and_resumes(tmp_path):
     assert (data["candidates"] <= high + 0.01).all()
 
 
-def test_the_wrong_euler_order_is_named(finished):
-    records = [r for r in read_journal(finished[0] / "journal.jsonl")
-               if r["event"] == "posture"]  # fmt: skip
-    zero = next(r for r in read_journal(finished[0] / "journal.jsonl")
-                if r["event"] == "zero")  # fmt: skip
-    config = fast_config()
-    right = order_residuals(config, zero, records)
-    assert min(right["rms"], key=right["rms"].get) == "ZXY" and not right["warning"]
-    wrong_config = parse_config(fast_text({'order = "ZXY"': 'order = "XYZ"'}))
-    wrong = order_residuals(wrong_config, zero, records)
-    assert "the order ZXY leaves" in wrong["warning"]
-
-
 # By the command line
 
 
@@ -424,9 +410,9 @@ def test_a_plan_that_leaves_the_limits_is_refused_before_arming(tmp_path):
     said = []
     record = commissioned(config, folder)
     run = make_run(config, folder, "calibrate", said.append, record=record)
-    wild = draw_candidates(config)
+    wild = draw(config, config.session.candidates)
     wild[:, 0] = 99999
-    choice = choose(config, config.to_deg(draw_candidates(config)))
+    choice = choose(config, config.to_deg(draw(config, config.session.candidates)))
     run.journal.write(
         "plan", candidates=wild.tolist(), choice=dataclasses.asdict(choice)
     )
