@@ -124,10 +124,8 @@ def listen(run: Run) -> None:
 
 
 def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
-    """Run a procedure, and say how it ended; returns the exit code.
-
-    Its drives were told to stop by then, whatever happened: `open_device` does it.
-    """
+    """Run a procedure, whose drives `open_device` stops whatever happens; say how it
+    ended, and return the exit code."""
     moved = len(run.journal.events("command"))
     with run.signals:
         try:

@@ -37,7 +37,7 @@ AxisName = Annotated[str, "of rig.toml"]
 WIDE = (-1e6, 1e6)
 RunPath = Annotated[Path, "the run's folder"]
 Saved = Annotated[Path, "rig.toml, or a run's folder"]
-Postures = Annotated[int, "postures"]
+Postures = Annotated[int, "postures", (1, 1_000_000)]
 Programs = Annotated[list[str], "programs named in the file that may be run"]
 Units = Annotated[int, "scan unit ids 1 to N", (1, 247)]
 BusName = Annotated[
@@ -194,8 +194,6 @@ def _session(
     """Run a new session; returns the exit code."""
     from rig.sessions import run_session
 
-    if count is not None and count < 1:
-        raise Refused(f"--count must be at least 1, got {count}")
     saved = None if calibration is None else str(calibration.resolve())
     config = given.load()
     start = {
@@ -301,11 +299,8 @@ UNTIL = "works until 0.4"
 
 
 def resolved(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Words as the parsers of commands know them, and what to say of old names.
-
-    ``setup home`` is the command ``home``, ``simulate calibrate`` is ``calibrate
-    --simulate``.
-    """
+    """Words as the parsers know them, ``home`` for ``setup home`` and ``calibrate
+    --simulate`` for ``simulate calibrate``, and what to say of old names."""
     words, notes = [*argv], []
     if simulated := words[:1] == ["simulate"] and words[1:2] and words[1][:1] != "-":
         del words[0]

@@ -31,11 +31,8 @@ def listen() -> tuple[socket.socket, str]:
 
 
 def start(folder: pathlib.Path) -> str:
-    """Start the live page of a run; returns the line to print. Never raises or waits.
-
-    It has its own process group, so that Ctrl-C in the terminal is not for it, and its
-    words go to ``live.log`` in the run's folder.
-    """
+    """Start the live page of a run, whose words go to LOG; returns the line to print.
+    Never raises or waits."""
     if importlib.util.find_spec("nicegui") is None:
         return f"no live page: nicegui is not installed: {install('live')}"
     try:
@@ -47,7 +44,7 @@ def start(folder: pathlib.Path) -> str:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                start_new_session=True,
+                start_new_session=True,  # Ctrl-C is not for it
             )
     except OSError as error:
         return f"no live page: {error}"
@@ -55,11 +52,7 @@ def start(folder: pathlib.Path) -> str:
 
 
 def write_report(folder: pathlib.Path) -> None:
-    """Have ``report.html`` of a run written.
-
-    Raises MissingExtraError: what writes it is not installed. Fault: it was not
-    written.
-    """
+    """Have ``report.html`` of a run written; MissingExtraError, or Fault: it is not."""
     require("report")
     try:
         subprocess.run(

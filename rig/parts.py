@@ -114,10 +114,8 @@ def model_of(config: RigConfig) -> DeviceModel | None:
 
 
 def require(command: str, simulated: bool = False) -> None:
-    """MissingExtraError, with what installs all that a command lacks.
-
-    ``simulated``: its device is, which needs the simulator.
-    """
+    """MissingExtraError, with what installs what a command lacks, its device real or
+    ``simulated``."""
     module = offered(COMMANDS)[command].module
     extra = "workbench" if simulated else _extra_of(module)
     needed = (module.partition(".")[0], *NEEDED[extra])

@@ -30,11 +30,8 @@ def run_session(
     start: dict[str, Any],
     folder: pathlib.Path | None = None,
 ) -> int:
-    """Run a session under the lock of its bus; returns the exit code.
-
-    ``command`` is told to whoever finds the bus locked; ``start`` has mode, inputs and
-    simulation, as the journal's first record; ``folder`` is that of a resumed run.
-    """
+    """Run a session under the lock of its bus, which says ``command``; its exit code.
+    ``start`` is as the journal's first record; ``folder`` that of a resumed run."""
     real = start["simulated"] is None
     procedure, kept_zero, doubts = _procedure(start, config)
     with contextlib.ExitStack() as stack:

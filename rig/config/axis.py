@@ -168,17 +168,17 @@ class Axis(Scale):
             key_name, unit, per, value = "accel_deg_s2", "/s^2", per_accel, motion[1]
             if name == "speed":
                 key_name, unit, per, value = "speed_deg_s", "/s", per_speed, motion[0]
+            key_name = self.key_of(key_name)
             if count < 1:
                 raise ValueError(
-                    f"{self.key_of(key_name)}: must be at least {1.0 / per:.6g} "
-                    f"{self.unit_name}{unit}, one count of the drive's register, got "
-                    f"{value:g}"
+                    f"{key_name}: must be at least {1.0 / per:.6g} {self.unit_name}"
+                    f"{unit}, one count of the drive's register, got {value:g}"
                 )
             try:
                 encode(count, place[1], "big")
             except ValueError as error:
-                name = self.key_of(key_name)
-                raise ValueError(f"{name}: the drive's register: {error}") from None
+                text = f"{key_name}: the drive's register: {error}"
+                raise ValueError(text) from None
         return counts
 
     @property

@@ -110,17 +110,15 @@ class ImuSettings(Section):
     def fields(self, stamp_unit: str = "") -> str:
         """What the fields of a record are taken for, in words; ``stamp_unit`` of its
         time, where that is known."""
-        stamp_unit = stamp_unit or self.stamp_unit or "the unit of the first stamp"
-        time_in = f"the time in {stamp_unit}"
+        unit = stamp_unit or self.stamp_unit or "the unit of the first stamp"
         if self.format in ("json", "sensorlogger"):
-            return f"the quaternion x, y, z, w of an orientation; {time_in}"
+            return f"the quaternion x, y, z, w of an orientation; the time in {unit}"
         if self.format == "sensorlog":
             return "a quaternion and its time, by the names in the app's header"
-        stamp = f"column {self.stamp_column} {time_in}"
+        stamp = f"column {self.stamp_column} the time in {unit}"
         stamp = stamp if self.stamp_column >= 0 else "no time"
-        if self.quaternion_columns:
-            columns = [*self.quaternion_columns]
-            return f"columns {columns} a quaternion x, y, z, w; {stamp}"
+        if columns := self.quaternion_columns:
+            return f"columns {[*columns]} a quaternion x, y, z, w; {stamp}"
         turns = zip(self.columns, str(self.order), self.signs, strict=True)
         angles = ", ".join(f"{c} about {'-' * (g < 0)}{axis}" for c, axis, g in turns)
         return f"columns {angles} (in this order), in {self.unit}; {stamp}"

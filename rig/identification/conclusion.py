@@ -72,16 +72,13 @@ def identify_affine(
 def uncertainty(
     chosen: list[Record], held_out: list[Record], zero_share: float
 ) -> dict[str, Any]:
-    """Noise of one recorded mean, and 95 % half-widths of A and b, axis by axis.
+    """noise_std_deg (m,) of a recorded mean, dof of an axis, basis, ci95 (m, n + 1):
+    95 % half-widths of [A | b] that hold all of these at once (Bonferroni).
 
     The noise is that of a fit of all postures, those held out too: it holds play, slow
     noise and drift, and the parameters' errors, which makes Student's t a little wide.
     Without held-out postures only the scatter of single readings is known, which is too
     optimistic where they are correlated; ``basis`` says which it was.
-
-    Returns:
-        noise_std_deg (m,), dof of an axis, basis, and ci95 (m, n + 1), half-widths of
-        [A | b], which hold all of these at once (Bonferroni).
     """
     everything, count = [*chosen, *held_out], len(chosen[0]["commanded_deg"]) + 1
     basis, dof = f"the fit of all {len(everything)} postures", len(everything) - count
@@ -117,11 +114,8 @@ def spread(off: Array) -> dict[str, Any]:
 def held_out_errors(
     config: RigConfig, held: list[Any], postures: dict[str, Record], calibration: Any
 ) -> tuple[list[Record], dict[str, Any]]:
-    """Records of held-out pairs that were both reached, and their errors in degrees.
-
-    ``before`` and ``after`` compensation, and of the ``prediction``; of postures by the
-    names ``before:0``, ``after:0``, ... Nothing where there are none.
-    """
+    """Records of held-out pairs that were both reached, and their errors in degrees,
+    ``before`` and ``after`` compensation and of the ``prediction``; nothing of none."""
     roles, names = ("before", "after"), postures.keys()
     both = [i for i in range(len(held)) if names >= {f"{r}:{i}" for r in roles}]
     if not both:
@@ -148,10 +142,9 @@ def estimate_drift(
     drift from any other, which cannot be taken out.
 
     Returns:
-        Of the ``visits``, the zero and then postures measured there: minutes (V,) and
-        angles_deg (V, m); size_deg, the largest angle; turn_deg_per_min (3,), w;
-        corrected: it is linear and to be taken out; left_deg, what is in the
-        measurements then; limit_deg, and whether left is over it.
+        Of the ``visits``: minutes (V,) and angles_deg (V, m); size_deg, the largest;
+        turn_deg_per_min (3,), w; corrected: it is linear and to be taken out; left_deg,
+        what is in the measurements then; limit_deg, and whether left is over it.
     """
     zero = visits[0]
     if len(visits) < 2:
@@ -198,10 +191,8 @@ def conclude(
     notes: dict[str, Any],
     compensated: bool = True,
 ) -> tuple[Any, dict[str, Any]]:
-    """The calibration, with ``notes`` in its file, and its summary, of a run's records.
-
-    ``compensated``: the held-out targets were, by this very calibration.
-    """
+    """The calibration, with ``notes`` in its file, and its summary, of a run's records;
+    ``compensated``: the held-out targets were, by this very calibration."""
     last = {record["event"]: record for record in records}
     zero, held = last["zero"], last.get("held_out", {"pairs": []})["pairs"]
     geometry, model = geometry_of(config), model_of(config)
@@ -266,10 +257,8 @@ def conclude(
 
 
 def check_matrix(config: RigConfig, matrix: ArrayLike) -> list[str]:
-    """Warnings of gains that are far from 1, of an (m, n) fitted matrix A.
-
-    Raises MotionFault: an axis answers the other way, or another axis's command.
-    """
+    """Warnings of gains far from 1, of an (m, n) fitted matrix A; MotionFault: an axis
+    answers the other way, or another axis's command."""
     gains = np.asarray(matrix, dtype=np.float64)
     faults, warnings = [], []
     names = config.axis_names

@@ -9,6 +9,7 @@ before it. A session needs all but the last, which it reaches itself.
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import json
 import pathlib
@@ -33,34 +34,30 @@ COMMANDS = {
 }  # that reach a state
 
 
+@dataclasses.dataclass
 class DeviceRecord:
     """The states of one device. ``reach``, ``void`` and ``left_at`` also save."""
 
-    def __init__(self, path: pathlib.Path) -> None:
-        self.path = path
-        self._states: dict[str, Any] = {}
-        self._voided: dict[str, Any] = {}
-        self._left: dict[str, Any] = {}
+    path: pathlib.Path
+    _states: dict[str, Any] = dataclasses.field(default_factory=dict)
+    _voided: dict[str, Any] = dataclasses.field(default_factory=dict)
+    _left: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def load(cls, path: pathlib.Path) -> DeviceRecord:
         """The record of a file, empty where there is none; Refused: it is no record."""
-        record = cls(path)
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
             if data["schema"] != 1:
                 raise ValueError(f"schema must be 1, got {data['schema']!r}")
-            record._states = dict(data["states"])
-            record._voided = dict(data["voided"])
-            record._left = dict(data["left"])
+            return cls(path, *(dict(data[key]) for key in ("states", "voided", "left")))
         except FileNotFoundError:
-            pass
+            return cls(path)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise Refused(
                 f"{path}: not a device record ({error!r}). Move the file away and "
                 "commission the device again: jaxcal-rig setup"
             ) from None
-        return record
 
     def save(self) -> None:
         """Write the file, atomically."""
@@ -79,9 +76,7 @@ class DeviceRecord:
 
     def reach(self, name: str, config: RigConfig, **evidence: Any) -> None:
         """A state was reached, with JSON values as evidence; Refused: none before it.
-
-        Where the evidence is not the one known before, the states after it are void.
-        """
+        Evidence that is not that of before makes the states after it void."""
         number = STATES.index(name)
         if number and (text := self.missing(config, STATES[number - 1])):
             raise Refused(text)

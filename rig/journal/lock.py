@@ -38,11 +38,7 @@ _ASKERS_S = 2.0  # the same where several `holder` calls follow one another
 
 
 class BusLock:
-    """The right to write to one bus, taken before its port is opened.
-
-    A serial device is known by its real path and a network address by what its name
-    resolves to, so that two names of one bus are one lock.
-    """
+    """The right to write to one bus, taken before its port is opened."""
 
     def __init__(self, settings: BusSettings) -> None:
         self.where = settings.where
@@ -52,10 +48,7 @@ class BusLock:
         self._told: dict[str, Any] = {}
 
     def acquire(self, what: str) -> BusLock:
-        """Take the lock for the command ``what``.
-
-        Raises Refused: another process, or this one, holds it; names the holder.
-        """
+        """Take the lock for the command ``what``; Refused names who holds it."""
         self._fd = fd = self._open(os.O_RDWR | os.O_CREAT)
 
         def taken(seconds: float) -> bool:
@@ -147,10 +140,8 @@ class BusLock:
         self._write_armed(config.told)
 
     def stood(self, forget: bool = False, standing: bool = True) -> None:
-        """All drives were seen standing, or, not ``standing``, one to go on.
-
-        ``forget``: they are gone as well, as simulated ones are.
-        """
+        """All drives were seen standing, or, not ``standing``, one to go on;
+        ``forget``: they are gone as well, as simulated ones are."""
         with contextlib.suppress(Refused, OSError):  # they stand, whatever is written
             if forget:
                 self.armed_path.unlink(missing_ok=True)
@@ -224,7 +215,8 @@ def held_by(told: dict[str, Any]) -> str:
 
 
 def _identity(settings: BusSettings) -> str:
-    """One text for every name of a bus."""
+    """One text for every name of a bus: a serial port's real path, what a host's name
+    resolves to."""
     if settings.transport in ("rtu", "serial"):
         return os.path.realpath(settings.device)
     if settings.transport == "can":

@@ -79,10 +79,8 @@ class Journal:
         self._clock = max(time.time(), last) - time.monotonic()
 
     def write(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
-        """Append one record; with ``sync`` it is on the disk when this returns.
-
-        JournalError: the disk is full or gone; the journal keeps its whole lines.
-        """
+        """Append one record; with ``sync`` it is on the disk when this returns. Where
+        it cannot be, JournalError, and the journal keeps its whole lines."""
 
         def make() -> Record:
             # A wall clock that is set meanwhile must not exchange two visits.
@@ -134,11 +132,10 @@ class RunFolder:
         self.folder = folder
         self.journal = Journal(folder / JOURNAL)
         self.listeners: list[Callable[[Record], None]] = []
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.callback(self.journal.close)
             self._begin(mode, start)
-        except BaseException:
-            self.journal.close()
-            raise
+            stack.pop_all()
 
     def _begin(self, mode: str, start: Record) -> None:
         import importlib.metadata  # these two are slow to load, and `stop` is not to be
@@ -167,10 +164,8 @@ class RunFolder:
         self.emit("start", sync=True, schema=SCHEMA, mode=mode, **start)
 
     def emit(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
-        """Journal an event, on the disk with ``sync``, then tell the listeners.
-
-        Where the disk is full JournalError is raised, but not for a stop's records.
-        """
+        """Journal an event, on the disk with ``sync``, then tell the listeners;
+        JournalError where the disk is full, but not for a stop's records."""
         record: Record = {"event": event, **fields}
         try:
             record = self.journal.write(event, sync=sync, **fields)

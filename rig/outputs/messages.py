@@ -208,16 +208,14 @@ def drift_text(drift: dict[str, Any], outputs: Sequence[str], unit: str = "deg")
     )
     if drift["corrected"]:
         rate = drift["angles_deg"][-1][worst] / drift["minutes"][-1]
-        text += (
-            f"; linear, {rate:+.4f} {unit}/min, and removed: {drift['left_deg']:.4f} "
-            f"{unit} remain"
-        )
+        text += f"; linear, {rate:+.4f} {unit}/min, and removed: "
+        text += f"{drift['left_deg']:.4f} {unit} remain"
     if drift["over"]:
         kind = "It is not linear. " if len(drift["minutes"]) == 3 else ""
         text += (
             f". {kind}Check for a loose phone, backlash, or a magnetic heading near "
-            "the motors"
         )
+        text += "the motors"
     return text
 
 

@@ -179,11 +179,8 @@ def _identify(run: Run) -> int:
 
 
 def collect(run: Run, count: int) -> int:
-    """Record ``count`` random postures: the paper's Datasets 4 and 5.
-
-    Writes pairs.csv and dataset.npz with ``candidates`` (episodes, M, n) and
-    ``measured`` (episodes, M, m), M as configured; an unfinished episode is in the CSV.
-    """
+    """Record ``count`` random postures, the paper's Datasets 4 and 5: pairs.csv, and in
+    dataset.npz whole episodes, ``candidates`` and ``measured`` (episodes, M, ...)."""
     config = run.config
 
     def make() -> dict[str, Any]:

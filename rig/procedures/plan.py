@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -70,7 +69,7 @@ def choose(
 
         # Greedy draws nothing.
         more: dict[str, Any] = (
-            {} if method == "greedy" else {"seed": config.session.seed}
+            {"seed": config.session.seed} if method != "greedy" else {}
         )
         if method in ("auto", "exact"):
             more["time_limit"] = limit_s
@@ -82,17 +81,24 @@ def choose(
         chosen = best = select(config.session.method or "auto")
         efficiency, note = float(chosen.efficiency), str(chosen.reason)
     else:
-        best = select("exact")
-        chosen, note = best, ""
+        chosen = best = select("exact")
+        note = ""
         if config.method != "exact" and available is None:
-            chosen, note = _by_its_method(config, select, best)
-        most, parameters = max(best.log_det, chosen.log_det), m * (n + 1)
-        efficiency = math.exp((chosen.log_det - most) / parameters)
-        if efficiency < config.session.min_efficiency:
-            least = config.session.min_efficiency
+            try:
+                chosen = select(config.method)
+                note = str(chosen.reason)
+            except Exception as error:
+                if config.method not in ("policy", "auto"):
+                    raise
+                # A missing checkpoint must not keep a rig from being calibrated.
+                reason = " ".join(str(error).split())[:200]
+                note = f"no policy could be used ({reason}); exact is used instead"
+        gap, least = best.log_det - chosen.log_det, config.session.min_efficiency
+        efficiency = math.exp(-max(0.0, gap) / (m * (n + 1)))
+        if efficiency < least:
             note = f"{config.method} reached a D-efficiency of {efficiency:.3f}, below "
             note += f"session.min_efficiency = {least:g}; using exact"
-            chosen, efficiency = best, math.exp((best.log_det - most) / parameters)
+            chosen, efficiency = best, 1.0
     return Choice(
         indices=tuple(int(i) for i in chosen.indices),
         log_det=float(chosen.log_det),
@@ -103,21 +109,6 @@ def choose(
         note=note,
         criterion=chosen.criterion,
     )
-
-
-def _by_its_method(
-    config: RigConfig, select: Callable[[str], Any], exact: Any
-) -> tuple[Any, str]:
-    """What the configured method selects, else the exact choice, and a note."""
-    try:
-        chosen = select(config.method)
-    except Exception as error:
-        if config.method not in ("policy", "auto"):
-            raise
-        # A missing or foreign checkpoint must not keep a rig from being calibrated.
-        reason = " ".join(str(error).split())[:200]
-        return exact, f"no policy could be used ({reason}); exact is used instead"
-    return chosen, getattr(chosen, "reason", "")
 
 
 def plan_lines(config: RigConfig, choice: Choice, pulses: Array) -> list[str]:
@@ -140,10 +131,8 @@ def plan_lines(config: RigConfig, choice: Choice, pulses: Array) -> list[str]:
 
 
 def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:
-    """Order of visits of (N, n) points of least travel time from (n,), ending anywhere.
-
-    The slowest axis sets the time. Optimal for N up to 12; above 200 as they are given.
-    """
+    """Order of visits of (N, n) points of least travel time from (n,), ending anywhere:
+    optimal for N up to 12; above MOST_IMPROVED as they are given."""
     if not 0 < len(points_deg) <= MOST_IMPROVED:
         return [*range(len(points_deg))]
     speed = tuple(axis.speed_deg_s for axis in config.axes)
