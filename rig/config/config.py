@@ -26,15 +26,10 @@ PHONE = (
 )  # fmt: skip
 SENSOR = ("names", "unit", "registers", "columns", "factors")
 UP = ("up_x", "up_y", "up_z")  # what a phone on an arm measures
-# Where bus and phone are reached, and when a session gives up or says that it is good,
-# may change between a run and its resumption.
+# Of [motion], [settle] and [session]: may change between a run and its resumption.
 UNMEASURED = (
-    "bus.", "imu.host", "imu.port", "imu.transport", "imu.allow", "imu.stale_s",
-    "imu.heading", "readings.host", "readings.port", "readings.device",
-    "readings.stale_s", "motion.poll_s", "motion.stall_s",
-    "motion.envelope_margin_deg", "motion.mirror_limits",
-    "settle.timeout_s", "session.verify_limit_deg",
-    "session.reference_tolerance_deg", "session.max_unreachable",
+    "poll_s", "stall_s", "envelope_margin_deg", "mirror_limits", "timeout_s",
+    "verify_limit_deg", "reference_tolerance_deg", "max_unreachable",
 )  # fmt: skip
 
 
@@ -61,20 +56,6 @@ def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
         for key in dict.fromkeys([*then, *now])
         if then.get(key) != now.get(key)
     ]
-
-
-def _flat(data: Any, at: str = "") -> dict[str, Any]:
-    """Key of rig.toml to value; axes are called by their names."""
-    if isinstance(data, dict):
-        pairs = [(str(name), value) for name, value in data.items()]
-    elif data and isinstance(data, list) and isinstance(data[0], dict):
-        pairs = [(value["name"], value) for value in data]
-    else:
-        return {at: data}
-    flat: dict[str, Any] = {}
-    for name, value in pairs:
-        flat |= _flat(value, f"{at}.{name}" if at else name)
-    return flat
 
 
 # Parts of a map that turn counts into places, and that say how a drive is stopped.
@@ -149,9 +130,7 @@ class RigConfig(Section):
     @property
     def source(self) -> settings.ImuSettings | settings.ReadingsSettings:
         """The phone, or the sensor."""
-        found = self.readings or self.imu
-        assert found is not None  # a rule
-        return found
+        return self.readings or self.phone
 
     @property
     def phone(self) -> settings.ImuSettings:
@@ -274,16 +253,20 @@ class RigConfig(Section):
             described["map"] = {"name": axis.map.name, "digest": axis.map.digest}
         return data
 
-    def changed_since(self, described: dict[str, Any]) -> list[str]:
-        """Keys that would make a resumed run move or measure differently, in words;
-        ``described()`` when it began is in its journal."""
-        now = json.loads(json.dumps(self.described(), default=str))
-        then, now = _flat(described), _flat(now)
-        # Keys that came after the run began had their defaults in it.
-        ends = ".comm_timeout_s"  # of each axis: may change as well
-        named = [k for k in then if not (k.startswith(UNMEASURED) or k.endswith(ends))]
-        then, now = ({key: data.get(key) for key in named} for data in (then, now))
-        return differences(then, now)
+    def changed_since(self, start: dict[str, Any]) -> list[str]:
+        """Keys that would make a resumed run measure otherwise, in words; ``start`` is
+        the first record of its journal."""
+        changed = differences(start["device"], self.device_fingerprint())
+        described = json.loads(json.dumps(self.described(), default=str))
+        for table in ("motion", "settle", "session"):
+            began = start["config"][table]  # later keys had their defaults in it
+            keys = [key for key in began if key not in UNMEASURED]
+            then, now = (
+                {f"{table}.{key}": values.get(key) for key in keys}
+                for values in (began, described[table])
+            )
+            changed += differences(then, now)
+        return changed
 
     def device_fingerprint(self) -> dict[str, Any]:
         """Key of rig.toml to value, of all that says which place a pulse count means;

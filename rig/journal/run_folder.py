@@ -151,7 +151,7 @@ class RunFolder:
             "started": now.isoformat(timespec="seconds"),
         }
         if starts := self.journal.events("start"):
-            if changed := self.config.changed_since(starts[0]["config"]):
+            if changed := self.config.changed_since(starts[0]):
                 raise ValueError(
                     f"{self.folder}: rig.toml has changed since this run began: "
                     f"{'; '.join(changed)}. New measurements would not be comparable. "

@@ -23,7 +23,6 @@ from rig.readings.attitude import (
     AttitudeFrame,
     Reading,
     angle_between_deg,
-    euler_to_matrix,
     frame_at,
 )
 
@@ -173,16 +172,17 @@ class Attitudes(Geometry):
         return back.as_matrix() @ reading
 
 
+@dataclasses.dataclass(frozen=True)
 class Up:
     """Where up is in the frame of an arm's tip, less that at the zero posture."""
 
-    def __init__(self, zero: Array, mounting: Array) -> None:
-        self.zero, self._mounting = zero, mounting
+    zero: Array  # (3, 3)
+    mounting: Array
 
     def of(self, readings: ArrayLike) -> Array:
         """(..., 3) of attitudes (..., 3, 3), RADIAN long."""
         rows = np.asarray(readings, dtype=np.float64)[..., 2, :]
-        return RADIAN * rows @ self._mounting.T
+        return RADIAN * rows @ self.mounting.T
 
     def angles(self, readings: ArrayLike) -> Array:
         return self.of(readings) - self.of(self.zero)
@@ -195,8 +195,7 @@ class Upright(Attitudes):
     of_joints = False
 
     def frame(self, zero: Array) -> Up:
-        mounting = euler_to_matrix(self._config.phone.mounting_deg, "ZYX")
-        return Up(zero, mounting)
+        return Up(zero, frame_at(self._config, zero).mounting)
 
     def unseen(self, zero: Array) -> list[str]:
         return [] if self._config.phone.heading == "absolute" else ["any turn"]

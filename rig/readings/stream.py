@@ -193,7 +193,9 @@ class StreamParser:
                 self._stamp_column = stamps[0] if stamps else -1
                 self._unit_s = 1.0 if stamps else None
                 used = [*self._quaternion, *stamps[:1]]
-                self._named = ", ".join(f"{fields[i]} (column {i})" for i in used)
+                names = [f"{fields[i]} (column {i})" for i in used]
+                self._named = f"by the header: {', '.join(names)}, x y z w of a "
+                self._named += "quaternion and its time"
                 return
 
     def _seconds(self, stamp: float, unit: str) -> float:
@@ -211,9 +213,7 @@ class StreamParser:
         """What the fields of a record are taken for, in words."""
         units = {value: name for name, value in UNITS_S.items()}
         unit = "" if self._unit_s is None else units[self._unit_s]
-        if self._named:
-            return f"by the header: {self._named}, x y z w of a quaternion and its time"
-        return self._settings.fields(unit)
+        return self._named or self._settings.fields(unit)
 
     def _check_width(self, fields: list[str], used: set[int]) -> None:
         width, whole = len(fields), max(self._width or 0, max(used) + 1)

@@ -118,7 +118,9 @@ def test_nonsense_is_one_clear_error(text):
 
 
 def test_a_run_is_resumed_with_other_addresses_and_limits_and_nothing_else():
-    began = json.loads(json.dumps(parse_config(EXAMPLE_TEXT).described()))
+    config = parse_config(EXAMPLE_TEXT)
+    began = {"config": config.described(), "device": config.device_fingerprint()}
+    began = json.loads(json.dumps(began))
     limits = "[session]\nverify_limit_deg = 0.1\nreference_tolerance_deg = 0.1\n"
     for old, new in (
         ("port = 5020", "port = 5021"),
@@ -136,7 +138,7 @@ def test_a_run_is_resumed_with_other_addresses_and_limits_and_nothing_else():
         (
             'map = "leadshine_pr"',
             'map = "generic"',
-            "axes.pitch.map.name: was leadshine",
+            "axes.pitch.map: was leadshine",
         ),
     ):
         changed = parse_config(EXAMPLE_TEXT.replace(old, new, 1))
