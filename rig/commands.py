@@ -18,7 +18,6 @@ from rig.faults import EXIT_FAULT, EXIT_OK, Refused
 from rig.options import (
     FILE,
     SIMULATOR,
-    SIMULATOR_FLAGS,
     ConfigPath,
     DeviceOptions,
     Path,
@@ -295,7 +294,6 @@ def example(name: Annotated[str, "default: list the names"] | None = None) -> in
 
 NUMBER = re.compile(r"[-+.0-9]+(?:[eE][-+]?[0-9]+)?")
 NUMBERS = re.compile(rf"{NUMBER.pattern}(?:,{NUMBER.pattern})*,?")
-UNTIL = "works until 0.4"
 
 
 def resolved(argv: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -308,13 +306,10 @@ def resolved(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     if step in STEPS.get(name, ()):
         del words[0]
     elif name in PLACES:
-        notes.append(f"{name} is now `jaxcal-rig {PLACES[name]} {name}`; this {UNTIL}")
-    flags = {word.partition("=")[0] for word in words[1:]} & SIMULATOR_FLAGS
+        new = f"jaxcal-rig {PLACES[name]} {name}"
+        notes.append(f"{name} is now `{new}`; this works until 0.4")
     if simulated:
         words.insert(1, "--simulate")
-    elif flags and name != "simulate":
-        given = " ".join([*words[:1], *sorted(flags)])
-        notes.append(f"type `jaxcal-rig simulate {given} ...`; the old form {UNTIL}")
     return _ordered(words), notes
 
 

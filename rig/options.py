@@ -47,7 +47,6 @@ class Simulation:
 
 
 SIMULATOR = {field.name for field in dataclasses.fields(Simulation)} | {"fault"}
-SIMULATOR_FLAGS = {f"--{name.replace('_', '-')}" for name in SIMULATOR}
 
 
 @dataclasses.dataclass

@@ -209,10 +209,7 @@ def test_the_commands_of_the_readme_parse():
         ("simulate --noise 1", "simulate --noise 1", ""),
         ("simulate calibrate --noise 1", "calibrate --simulate --noise 1", ""),
         ("simulate setup axes", "axes --simulate", ""),
-        (
-            "calibrate --simulate --noise=1", "calibrate --simulate --noise=1",
-            "type `jaxcal-rig simulate calibrate --noise ...`",
-        ),
+        ("calibrate --simulate --noise=1", "calibrate --simulate --noise=1", ""),
         ("goto run --to 1,-2.5,3 --arm", "goto run --arm --to 1 -2.5 3", ""),
         ("goto --to=1,2,3 run", "goto run --to 1 2 3", ""),
         ("goto --to 1 2 3 run", "goto run --to 1 2 3", ""),
