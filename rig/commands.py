@@ -15,15 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from jaxcal.arguments import Parser
 from jaxcal.extras import MissingExtraError
 from rig.faults import EXIT_FAULT, EXIT_OK, Refused
-from rig.options import (
-    FILE,
-    SIMULATOR,
-    ConfigPath,
-    DeviceOptions,
-    Path,
-    Session,
-    Step,
-)
+from rig.options import FILE, SIMULATOR, ConfigPath, DeviceOptions, Path, Session, Step
 from rig.parts import COMMANDS, PLACES, STEPS, model_of, offered, part
 
 if TYPE_CHECKING:

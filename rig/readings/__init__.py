@@ -15,8 +15,7 @@ from rig.readings.source import Source
 
 
 def make_source(
-    config: RigConfig,
-    report: Callable[..., object] = lambda event, **fields: None,
+    config: RigConfig, report: Callable[..., object] = lambda event, **fields: None
 ) -> Source:
     """What a device is measured with; to be opened. ``report`` gets its events."""
     if config.readings is not None:
