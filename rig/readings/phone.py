@@ -22,7 +22,7 @@ from rig.readings.source import Source, listener_of
 from rig.readings.stream import MAX_BODY, LineSplitter, StreamParser
 
 RECONNECT_S = 0.2
-MOST_OPEN = 4  # connections at a time
+MOST_OPEN = 64  # connections at a time
 PATIENCE_S = 5.0  # of a connection for a line, or a whole message
 MAX_HEAD = 8192  # bytes of a message before its body
 LOOK_S = 0.05  # between two looks at whether to end
@@ -44,10 +44,10 @@ class Imu(Source):
     """The attitude of the phone, (3, 3) to its world: of one, whoever else connects.
 
     Who may not be heard is refused unread. At most MOST_OPEN connections are open, none
-    for longer than PATIENCE_S without a word; the oldest that has sent nothing makes
-    way for the next. Messages are pushed over any connection of one address. Lines come
-    over one: a phone that lost its Wi-Fi comes back on another, which takes its place
-    once no reading of the old was of use for ``stale_s``; until then it is refused.
+    for longer than PATIENCE_S without a word. Messages are pushed over any connection
+    of one address. Lines come over one: a phone that lost its Wi-Fi comes back on
+    another, which takes its place once no reading of the old was of use for
+    ``stale_s``; until then it is refused.
     """
 
     whose, table = "the phone", "imu"
@@ -64,7 +64,6 @@ class Imu(Source):
         self.parser = StreamParser(settings)
         self._counts = self.parser.counts
         self._current: Connection | None = None  # that lines are taken of
-        self._unheard: list[asyncio.Task[None]] = []  # that have sent nothing yet
         self._closing = threading.Event()
         self._port = settings.port
         self._listener: socket.socket | None = None
@@ -178,23 +177,14 @@ class Imu(Source):
                 except OSError:
                     await asyncio.sleep(LOOK_S)
                     continue
-                room = MOST_OPEN - len(tasks)
-                if self._admits(address) and (room > 0 or self._unheard):
-                    if room <= 0:
-                        self._unheard.pop(0).cancel()
+                if self._admits(address) and len(tasks) < MOST_OPEN:
                     task = loop.create_task(self._hear(address, sock=made))
                     tasks.add(task)
-                    self._unheard.append(task)
                     task.add_done_callback(tasks.discard)
-                    task.add_done_callback(self._has_sent)
                 else:  # it is still sending: closed at once, it would not see why
                     with contextlib.suppress(OSError):
                         made.send(_answer(403, False))
                     loop.call_later(LOOK_S, made.close)
-
-    def _has_sent(self, task: asyncio.Task[None] | None) -> None:
-        if task in self._unheard:
-            self._unheard.remove(task)
 
     async def _hear(self, address: str, **how: Any) -> None:
         """Take what one connection sends, until it ends or says nothing."""
@@ -210,7 +200,6 @@ class Imu(Source):
                 while stays:  # not wait_for, which may lose the cancelling of a task
                     async with asyncio.timeout(PATIENCE_S):
                         stays = await hear(connection)
-                    self._has_sent(asyncio.current_task())
             finally:
                 connection.writer.close()
                 self._current = None if self._current is connection else self._current

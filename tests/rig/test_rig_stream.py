@@ -433,16 +433,14 @@ def test_strangers_are_refused_before_a_byte_is_read_and_cost_no_thread():
         assert not taken
 
 
-def test_connections_that_send_nothing_are_few_and_make_way(monkeypatch):
+def test_connections_that_send_nothing_keep_no_phone_out(monkeypatch):
     """Without imu.allow anybody may be the phone, until one is."""
     monkeypatch.setattr(receiver, "PATIENCE_S", 600.0)
     settings = changed(HYPER, format="sensorlogger", port=0)
     with Imu(settings) as imu, contextlib.ExitStack() as stack:
-        idle = [stack.enter_context(connect(imu)) for _ in range(20)]
+        for _ in range(20):
+            stack.enter_context(connect(imu))
         assert push(imu, 10) == 200
-        for each in idle[: 20 - receiver.MOST_OPEN]:
-            with contextlib.suppress(ConnectionError):
-                assert each.recv(64) == b""
 
 
 def test_connections_that_send_nothing_are_short(monkeypatch):
