@@ -27,11 +27,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     from rig.commands import make_parser, resolved
     from rig.parts import require
 
-    argv, notes = resolved(argv)
+    argv, note = resolved(argv)
     command, code = argv[0] if argv else None, faults.EXIT_BAD_INPUT
     try:
-        for note in notes:
-            print(f"jaxcal-rig: {note}", file=sys.stderr)
+        print(note, file=sys.stderr, end="\n" if note else "")
         args = make_parser(command).parse_args(argv)
         require(args.command, getattr(args, "simulate", False))
         require_kept(vars(args))

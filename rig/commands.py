@@ -288,21 +288,21 @@ NUMBER = re.compile(r"[-+.0-9]+(?:[eE][-+]?[0-9]+)?")
 NUMBERS = re.compile(rf"{NUMBER.pattern}(?:,{NUMBER.pattern})*,?")
 
 
-def resolved(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+def resolved(argv: Sequence[str]) -> tuple[list[str], str]:
     """Words as the parsers know them, ``home`` for ``setup home`` and ``calibrate
     --simulate`` for ``simulate calibrate``, and what to say of old names."""
-    words, notes = [*argv], []
+    words, note = [*argv], ""
     if simulated := words[:1] == ["simulate"] and words[1:2] and words[1][:1] != "-":
         del words[0]
     name, step = (*words, "", "")[:2]
     if step in STEPS.get(name, ()):
         del words[0]
     elif name in PLACES:
-        new = f"jaxcal-rig {PLACES[name]} {name}"
-        notes.append(f"{name} is now `{new}`; this works until 0.4")
+        new = f"`jaxcal-rig {PLACES[name]} {name}`"
+        note = f"jaxcal-rig: {name} is now {new}; this works until 0.4"
     if simulated:
         words.insert(1, "--simulate")
-    return _ordered(words), notes
+    return _ordered(words), note
 
 
 def _ordered(words: list[str]) -> list[str]:

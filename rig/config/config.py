@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from rig.config import settings
-from rig.config.axis import AXIS_NAMES, DEFAULT_ROTATES, MOST_AXES, Axis, Pulses, Scale
+from rig.config.axis import AXIS_NAMES, MOST_AXES, Axis, Pulses, Scale
 from rig.config.schema import ConfigError, Section, key, parse, read_text
 from rig.stop_config import rows_of
 
@@ -79,7 +79,7 @@ class RigConfig(Section):
     """A whole, valid configuration."""
 
     bus: settings.BusSettings
-    axes: tuple[Axis, ...]
+    axes: tuple[Axis, ...] = key("of the device", min_length=1, max_length=MOST_AXES)
     imu: settings.ImuSettings | None = None  # the phone, or
     readings: settings.ReadingsSettings | None = None  # numbers
     model: settings.ModelSettings | None = None  # else it is affine
@@ -320,6 +320,9 @@ class RigConfig(Section):
                 why = "missing; a phone measures rotations about X, Y, Z"
                 yield f"axes.{axis.name}.rotates: {why}"
                 return
+        letters = [str(axis.rotates) for axis in by_letters]
+        if len(set(letters)) < len(letters):
+            yield f"axes: rotates must differ between them, got {', '.join(letters)}"
         for middle in by_letters:
             within = -90.0 < middle.min_deg and middle.max_deg < 90.0
             if within or middle.rotates != self.mechanism.order[1]:
@@ -398,19 +401,9 @@ def parse_config(
 
 
 def _repeated(data: dict[str, Any]) -> Iterator[str]:
-    """Names, units and letters that axes share; told even beside other faults."""
-    tables = data.get("axes")
-    axes = [
-        {"rotates": DEFAULT_ROTATES.get(str(table.get("name")))} | table
-        for table in rows_of(tables)
-    ]
-    if isinstance(tables, list) and not 1 <= len(tables) <= MOST_AXES:
-        yield f"axes: must be 1 to {MOST_AXES} tables, got {len(tables)}"
-    by_letters = "readings" not in data and not (
-        isinstance(data.get("model"), dict) and data["model"].get("urdf")
-    )
-    for name in ("name", "unit", *(["rotates"] if by_letters else [])):
-        values = [str(a[name]) for a in axes if a.get(name) is not None]
+    """Names and units that axes share; told even beside other faults."""
+    for name in ("name", "unit"):
+        values = [str(axis[name]) for axis in rows_of(data.get("axes")) if name in axis]
         if len(set(values)) < len(values):
             yield f"axes: {name} must differ between them, got {', '.join(values)}"
 

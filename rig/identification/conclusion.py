@@ -223,7 +223,6 @@ def conclude(
     }
     notes |= {
         "approach_overshoot_deg": config.motion.approach_overshoot_deg,
-        "drift_corrected": bool(drift and drift["corrected"]),
         **shared,
     }
     if model is not None:
@@ -240,11 +239,7 @@ def conclude(
     reasons = [mispairing.reason] if mispairing else []
     limit = config.session.verify_limit_deg
     reasons += recalibrate({**errors, "drift": drift}, limit)
-    notes |= {
-        "mechanism_order": config.mechanism.order,
-        "noise_from": limits["basis"],
-        "verdict": {"good": not reasons, "reasons": reasons},
-    }
+    notes["verdict"] = {"good": not reasons, "reasons": reasons}
     noise = np.maximum(1e-9, limits["noise_std_deg"])
     calibration = identify_affine(config, chosen, noise, notes, zero_share)
     return calibration, {

@@ -88,10 +88,6 @@ class Imu(Source):
             self._thread.join(2.0)
 
     @property
-    def port(self) -> int:
-        return self._port
-
-    @property
     def where(self) -> str:
         return f"{self.settings.host}:{self.port}"
 

@@ -85,7 +85,7 @@ class Source(abc.ABC):
         self._lock = threading.Lock()
         self._ring: deque[Reading] = deque(maxlen=RING)
         self._counts: Counter[str] = Counter()
-        self._arrived = 0.0
+        self._arrived, self._port = 0.0, 0
 
     # Of a kind
 
@@ -105,7 +105,7 @@ class Source(abc.ABC):
     @property
     def port(self) -> int:
         """TCP or UDP port, where there is one."""
-        return 0
+        return self._port
 
     def turn(self, world: Array) -> None:
         """Turn all readings, those that were received too; of attitudes alone."""
