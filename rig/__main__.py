@@ -30,7 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv, note = resolved(argv)
     command, code = argv[0] if argv else None, faults.EXIT_BAD_INPUT
     try:
-        print(note, file=sys.stderr, end="\n" if note else "")
+        if note:
+            print(note, file=sys.stderr)
         args = make_parser(command).parse_args(argv)
         require(args.command, getattr(args, "simulate", False))
         require_kept(vars(args))
