@@ -1,7 +1,5 @@
-"""The commands that move, measure and stop, and the parser of every command.
-
-Each loads what it needs. All of them, of other packages too, are entry points.
-"""
+"""The commands that move, measure and stop, each of which loads what it needs, and the
+parser of every command: they are entry points, those of other packages too."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""Pages of a run, each made by a process of its own: the live one, and the report.
-
-A session starts these commands of ``jaxcal-rig`` and loads nothing of what they need.
-"""
+"""Pages of a run, the live one and the report, each made by a command of its own: a
+session loads nothing of what they need."""
 
 from __future__ import annotations
 

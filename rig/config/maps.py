@@ -1,9 +1,5 @@
-"""Register maps: a drive family as data; and their parts: values, words, frames, bits.
-
-A map is one TOML file in ``rig/maps`` (or anywhere: a configuration may give a path).
-It says where a drive keeps its status, position and alarm, and which registers to write
-to move, stop, enable. Nothing here opens a port.
-"""
+"""Register maps: where a family of drives keeps status, position and alarm, and what is
+written to move, stop, enable: a TOML file in ``rig/maps``, or of one's own."""
 
 import contextlib
 import hashlib

@@ -1,9 +1,8 @@
 """The base of every table read from a file, and its faults in words.
 
-A key is described once, by its field: type, default, bounds and meaning; its unit ends
-its name. That one description checks the value, words the fault, and fills the
-reference. Modules of tables leave out ``from __future__ import annotations``:
-pydantic would compile every annotation again at each start.
+The field of a key, its type, default, bounds and meaning, checks the value, words the
+fault, and fills the reference. Modules of tables leave out ``from __future__ import
+annotations``: pydantic would compile every annotation again at each start.
 """
 
 from __future__ import annotations

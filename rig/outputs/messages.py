@@ -1,7 +1,4 @@
-"""What the events of a run and the results of a calibration come to, in words.
-
-Console, page and report say the same.
-"""
+"""Events of a run and results of a calibration in words, for console, page, report."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""What console, page and report show of a run, from the records of its journal.
-
-``RunState`` takes the records one by one and touches neither files nor clocks: a page
-that is opened late shows the same.
-"""
+"""What console, page and report show of a run, from the records of its journal."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """telemetry.jsonl: what phone and drives say while a session runs, for the live page.
 
-A thread takes what others have received already, at most 20 times a second, and appends
-a line. It never uses the bus, never makes the session wait, and ends where it fails.
-The file is not fsynced, and no results are computed from it.
+A thread appends what others have received already, at most 20 times a second. It never
+uses the bus, never makes the session wait, and ends where it fails.
 """
 
 from __future__ import annotations

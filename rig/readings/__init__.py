@@ -1,9 +1,5 @@
-"""What is measured: a phone's attitude, or the numbers of a sensor.
-
-``source`` is what motion and measurement ask; ``phone`` with ``stream`` and
-``attitude``, and ``rig_workbench.numbers`` are its kinds; ``geometry`` is how two
-readings compare.
-"""
+"""What is measured: a phone's attitude, or the numbers of a sensor, each a ``source``;
+``geometry`` is how two readings compare."""
 
 from __future__ import annotations
 
