@@ -241,16 +241,12 @@ class RigConfig(Section):
         return np.asarray(pulses, dtype=np.float64) / scales
 
     def described(self) -> dict[str, Any]:
-        """Every key as JSON, as the journal keeps it; of a map its name and digest."""
+        """Every key as JSON, as the journal keeps it; of a map its name."""
         data = self.model_dump(exclude={"output", "device"})
-        if self.model is None:
-            del data["model"]
-        else:
-            data["model"]["digest"] = self._model_digest
         # Those left out too.
         data["session"] |= {"ranges": self.ranges, "k": self.k, "method": self.method}
         for axis, described in zip(self.axes, data["axes"], strict=True):
-            described["map"] = {"name": axis.map.name, "digest": axis.map.digest}
+            described["map"] = {"name": axis.map.name}
         return data
 
     def changed_since(self, start: dict[str, Any]) -> list[str]:

@@ -2,8 +2,6 @@
 written to move, stop, enable: a TOML file in ``rig/maps``, or of one's own."""
 
 import contextlib
-import hashlib
-import json
 import pathlib
 import tomllib
 from collections.abc import Iterator
@@ -196,11 +194,6 @@ class DriveMap(Section):
     def has(self, table: str) -> bool:
         """Whether there is a table, such as ``comm_timeout``, ``limits``, ``home``."""
         return getattr(self, table, None) is not None
-
-    @property
-    def digest(self) -> str:
-        data = json.dumps(tomllib.loads(self.text), sort_keys=True, default=str)
-        return hashlib.sha256(data.encode()).hexdigest()
 
 
 class RegisterMap(DriveMap):
