@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -16,8 +17,9 @@ from typing import Any
 from rig.core.device import Device
 
 TELEMETRY = "telemetry.jsonl"
+OLDER = "telemetry.old.jsonl"  # takes what does not fit into TELEMETRY
 PERIOD_S = 0.05
-MAX_BYTES = 8 << 20  # half an hour; then the file begins anew
+MAX_BYTES = 8 << 20  # of each of the two files: together over an hour
 MOST_READINGS = 200  # of the window over which scatter is taken
 
 
@@ -46,7 +48,7 @@ def _record(device: Device, closing: threading.Event) -> None:
                 file.write(line.encode())
                 full = file.tell() > MAX_BYTES
             if full:
-                path.unlink()
+                os.replace(path, path.with_name(OLDER))
 
 
 def sample(device: Device) -> dict[str, Any]:
