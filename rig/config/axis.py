@@ -27,17 +27,12 @@ class Scale(Section):
     millimetres of a translation: ``x = lead p / (omega kappa)``."""
 
     kind: Literal["rotation", "translation"] = key("what the axis does", "rotation")
-    lead_mm: float | None = key(
-        "of a translation: travel per turn of its screw, pulley or pinion",
-        None, 1e-3, 1e4,
-    )  # fmt: skip
+    lead_mm: float | None = key("of a translation: travel per turn", None, 1e-3, 1e4)
     pulses_per_rev: int = key(
-        "omega: pulses per motor turn, as set in the drive", ..., 1, 100_000_000
+        "omega: pulses per turn of the motor", ..., 1, 100_000_000
     )
     reduction: float = key("kappa: motor turns per joint turn", 1.0, 1e-3, 1e5)
-    direction: Literal[1, -1] = key(
-        "-1: positive pulses turn the joint in the negative direction", 1
-    )
+    direction: Literal[1, -1] = key("-1: positive pulses turn the joint negatively", 1)
 
     @classmethod
     def of(cls, described: dict[str, Any]) -> "Scale":

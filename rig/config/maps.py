@@ -164,18 +164,12 @@ class DriveMap(Section):
     """One drive family, of whatever kind."""
 
     schema_: Literal[1] = key("version of the schema", alias="schema")
-    drive: str = key(
-        "kind of its drives: modbus, or your own class as `FILE.py:CLASS`, relative "
-        "to the map, or `MODULE:CLASS`", "modbus",
-    )  # fmt: skip
+    drive: str = key("modbus, or your own: `FILE.py:CLASS`, `MODULE:CLASS`", "modbus")
     name: str = key("name of the map", min_length=1)
     title: str = key("drives it is for", min_length=1)
     sources: str = key("source of these values", min_length=1)
     confidence: str = key("how far the map was tested", "")
-    restart_s: float = key(
-        "time after a stop within which a drive may move on; it is watched for this "
-        "long", 2.0, 2.0, 60,
-    )  # fmt: skip
+    restart_s: float = key("watched after a stop, lest it moves on", 2.0, 2.0, 60)
     absolute_encoder: bool = key("the position survives a loss of power", False)
     ready_s: float = key("longest, to enable or reset an alarm", 1.0, 0, 30)
     inter_frame_s: float = key("silence that the drive needs between frames", 0.0, 0, 1)
@@ -200,20 +194,14 @@ class RegisterMap(DriveMap):
     """One family of Modbus drives, by its registers."""
 
     drive: Literal["modbus"] = "modbus"
-    word_order: Literal["big", "little"] = key(
-        "order of 32-bit pairs; big: high word first, little: low word first"
-    )
+    word_order: Literal["big", "little"] = key("of 32-bit pairs; big: high word first")
     inter_frame_s: float = key("silence that the drive needs between frames", ..., 0, 1)
     settings: dict[str, str | int | float | bool] = key(
         "none: registers are keys of a class of your own", {}, max_length=0
     )
     serial: dict[str, int | str] = key("default line format of the maker", {})
-    units: Units = key(
-        "`speed`, `accel` of the registers; counts `speed_per_unit`, `accel_per_unit`"
-    )
-    status: StatusWord = key(
-        "address, type; `done`, `moving`, `fault`, `enabled` as bits `{ set, clear }`"
-    )
+    units: Units = key("`speed`, `accel`; counts `speed_per_unit`, `accel_per_unit`")
+    status: StatusWord = key("`done`, `moving`, `fault`, `enabled` as `{ set, clear }`")
     position: Position = key("address, type (i32) of the position in pulses")
     alarm: Alarm | None = key("address, type; `names` of its codes", None)
     move: Move = key(
@@ -221,28 +209,24 @@ class RegisterMap(DriveMap):
         "`trigger` is the last word"
     )
     stop: Writes = key("`write`: frames of the quick stop; torque must stay on")
-    hold: Writes | None = key(
-        "`write` with `position`: its place becomes its target, after a stop", None
-    )
+    hold: Writes | None = key("`write` with `position`, its target after a stop", None)
     broadcast_stop: bool = key("all units of a serial line obey a stop to 0", False)
     enable: Writes | None = key("`write`: switch the power stage on", None)
     alarm_reset: Writes | None = key("`write`: reset an alarm", None)
     comm_timeout: CommTimeout | None = key(
-        "`write` with `timeout`, counts `per_s`: the drive's watch of the line", None
+        "`timeout` of the line, counts `per_s`", None
     )
     limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
     set_zero: Writes | None = key(
         "`write`: its place becomes 0; or `home:i32`: 2^30, if it takes a value", None
     )
     identity: dict[str, Read] = key("registers that `identify` prints", {})
-    recognise: dict[str, tuple[int, int]] = key(
-        "[lowest, highest] value of identity registers for drives of this family", {}
-    )
+    recognise: dict[str, tuple[int, int]] = key("[lowest, highest] of `identity`", {})
     pulses_per_rev: Read | None = key("register of pulses per motor turn", None)
     target: Position | None = key("of the last move; read if its reply is lost", None)
     home: Writes | None = key("`write`: start the drive's own homing", None)
     homed: Predicate | None = key(
-        "bits of the status word that homing sets and a loss of power clears", None
+        "bits set by homing, cleared by a loss of power", None
     )
 
     @property

@@ -208,9 +208,7 @@ class ModelSettings(Section):
     base: str = advanced("of urdf: the fixed link; absent: the root", "")
     tip: str = key("of urdf: link that carries phone or sensor; absent: the last", "")
     sensor: Literal["gravity", "position"] = key(
-        "of urdf: what is measured at that link: gravity (the direction of up, by a "
-        "phone or an accelerometer at rest), or the position in the file's metres",
-        "gravity",
+        "of urdf, at its tip: the direction of up, or metres of the file", "gravity"
     )
     magnitude: float = advanced("gravity in the readings' unit", 9.81, 1e-6, 1e6)
     factory: str = key("FILE.py:NAME or MODULE:NAME of a model, or what makes one", "")
@@ -241,16 +239,12 @@ class MotionSettings(Section):
         "limit of all speed_deg_s; raise it only with a reason", 120.0, 1e-3, 5000
     )
     max_step_deg: float = key("longer moves are split", 15.0, 0.1, 360)
-    approach_overshoot_deg: float = key(
-        "> 0: approach every posture from below, against backlash", 0.0, 0, 20
-    )
+    approach_overshoot_deg: float = key("> 0: reach postures from below", 0.0, 0, 20)
     position_tolerance_deg: float = advanced(
-        "a drive this close to its target has reached it", 0.05, 1e-4, 5
+        "of a drive from its target", 0.05, 1e-4, 5
     )
     poll_s: float = advanced("between two polls of drives and IMU", 0.05, 0.001, 0.1)
-    stall_s: float = advanced(
-        "a drive that stands still off its target this long has a fault", 1.0, 0.05, 30
-    )
+    stall_s: float = advanced("at rest off its target until a fault", 1.0, 0.05, 30)
     envelope_margin_deg: float = advanced("of the IMU past the limits", 15.0, 0.1, 90)
     mirror_limits: bool = advanced("also write the soft limits to the drives", False)
 
@@ -284,10 +278,8 @@ class SessionSettings(Section):
     verify_postures: int = key("held out, measured before and after", 4, 0, 1000)
     verify_limit_deg: float = key("largest good error, compensated", 0.5, 1e-3, 45)
     drift_limit_deg: float = key("largest nonlinear drift of zero", 0.2, 1e-3, 45)
-    reference_tolerance_deg: float = advanced(
-        "largest distance of the zero posture from its earlier place", 0.5, 1e-3, 45
-    )
+    reference_tolerance_deg: float = advanced("of the zero posture", 0.5, 1e-3, 45)
     max_unreachable: int = advanced("unreachable postures until a fault", 3, 0, 1000)
     zero: Literal["here", "drive"] = key(
-        "here: the device is in its zero posture; drive: move to pulse 0", "here"
+        "drive: pulse 0; here: where it stands", "here"
     )
