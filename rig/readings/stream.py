@@ -152,10 +152,7 @@ class StreamParser:
     def _line(self, line: bytes) -> tuple[float | None, Array]:
         """Seconds on the phone's clock, and (3, 3) phone to its world."""
         s = self._settings
-        try:
-            text = line.decode("utf-8").strip(" \t\0")
-        except UnicodeDecodeError:
-            raise _Dropped("not text") from None
+        text = line.decode("utf-8", "replace").strip(" \t\0")
         fields = [field.strip(" \t") for field in text.split(s.separator)]
         if fields[-1] == "" and len(fields) > 1:
             fields.pop()
@@ -172,6 +169,7 @@ class StreamParser:
             used.add(self._stamp_column)
         self._check_width(fields, used)
         values = {column: _number(fields[column]) for column in used}
+        self._width = len(fields)
         stamp = None
         if self._stamp_column >= 0:
             stamp = self._seconds(values[self._stamp_column], s.stamp_unit or "ms")
@@ -221,11 +219,7 @@ class StreamParser:
             fractions = fields[1 + width % 2 :: 2]
             if all(map(str.isdecimal, fractions)) and "." not in "".join(fields):
                 raise _Dropped("decimal commas")
-        if self._width is None and width > max(used):
-            for column in used:
-                _number(fields[column])
-            self._width = width
-        if width != self._width:
+        if width != (self._width or max(width, whole)):
             raise _Dropped(f"not of {self._width} columns")
 
     def _euler(self, values: list[float]) -> Array:
