@@ -46,6 +46,11 @@ class BusSettings(Section):
             yield f"{required}: missing; transport {self.transport!r} needs one"
 
 
+def _separator_rule(text: str) -> Iterator[str]:
+    if len(text) != 1 or text in "0123456789+-.eE\r\n":
+        yield f"separator: must be one character that is in no number, got {text!r}"
+
+
 def _by_format(hyperimu: Any, other: Any) -> Callable[[dict[str, Any]], Any]:
     return lambda made: hyperimu if made["format"] == "hyperimu" else other
 
@@ -137,9 +142,7 @@ class ImuSettings(Section):
             yield f"column_count: {self.column_count} is too few for the columns named"
         if self.order is None:
             yield "order: missing; a line stream does not state the order of its angles"
-        if len(self.separator) != 1 or self.separator in "0123456789+-.eE\r\n":
-            got = repr(self.separator)
-            yield f"separator: must be one character that is in no number, got {got}"
+        yield from _separator_rule(self.separator)
 
 
 class ReadingRegister(Read):
@@ -170,7 +173,7 @@ class ReadingsSettings(Section):
     bytesize: int = key("of a serial port", 8, 7, 8)
     registers: tuple[ReadingRegister, ...] = key("modbus: one per name", ())
     columns: tuple[Column, ...] = key("of the numbers in a line", (), max_length=12)
-    separator: str = key("between columns", ",", min_length=1, max_length=1)
+    separator: str = key("between columns", ",")
     factors: tuple[float, ...] = key("units per count that is sent", ())
     request: str = advanced("sent before each line, if the sensor needs it", "")
     period_s: float = advanced("time between two polls of registers", 0.02, 0.001, 1)
@@ -196,9 +199,7 @@ class ReadingsSettings(Section):
                 yield f"{key_name}: must be {len(self.names)}, as names, got {count}"
         if self.transport == "serial" and not self.device:
             yield "device: missing; transport 'serial' needs one"
-        if self.separator in "0123456789+-.eE\r\n":
-            got = repr(self.separator)
-            yield f"separator: must be a character that is in no number, got {got}"
+        yield from _separator_rule(self.separator)
 
 
 class ModelSettings(Section):
