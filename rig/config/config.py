@@ -79,7 +79,7 @@ class RigConfig(Section):
     """A whole, valid configuration."""
 
     bus: settings.BusSettings
-    axes: tuple[Axis, ...] = key("of the device", min_length=1, max_length=MOST_AXES)
+    axes: tuple[Axis, ...]
     imu: settings.ImuSettings | None = None  # the phone, or
     readings: settings.ReadingsSettings | None = None  # numbers
     model: settings.ModelSettings | None = None  # else it is affine
@@ -398,8 +398,11 @@ def parse_config(
 
 def _repeated(data: dict[str, Any]) -> Iterator[str]:
     """Names and units that axes share; told even beside other faults."""
+    tables = data.get("axes")
+    if isinstance(tables, list) and not 1 <= len(tables) <= MOST_AXES:
+        yield f"axes: must be 1 to {MOST_AXES} tables, got {len(tables)}"
     for name in ("name", "unit"):
-        values = [str(axis[name]) for axis in rows_of(data.get("axes")) if name in axis]
+        values = [str(axis[name]) for axis in rows_of(tables) if name in axis]
         if len(set(values)) < len(values):
             yield f"axes: {name} must differ between them, got {', '.join(values)}"
 
