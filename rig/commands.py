@@ -7,7 +7,7 @@ import argparse
 import contextlib
 import functools
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 from jaxcal.arguments import Parser
@@ -350,12 +350,18 @@ def make_parser(only: str | None = None) -> Parser:
     about += " Start with `setup`."
     parser = RigParser(prog="jaxcal-rig", description=about, epilog=EPILOG)
     added = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    absent: dict[str, str] = {}
-    if only in (names := offered(COMMANDS)):
-        functions = [part(only, only, COMMANDS)]
-    else:
-        functions = _loaded(names, absent)
-    for function in functions:
+    names, functions, absent = offered(COMMANDS), list[Any](), dict[str, str]()
+    for name in [only] if only in names else names:
+        try:
+            functions.append(part(name, name, COMMANDS))
+        except MissingExtraError as error:  # what to install
+            if name == only:
+                raise
+            absent[name] = str(error)
+    # In the order of their modules' lines.
+    for function in sorted(
+        functions, key=lambda f: (f.__module__, f.__code__.co_firstlineno)
+    ):
         name, text = function.__name__, function.__doc__
         place = PLACES.get(name)
         told = {} if place else {"help": text}  # a step is listed in its place's help
@@ -371,15 +377,3 @@ def make_parser(only: str | None = None) -> Parser:
     for name, text in absent.items():
         added.add_parser(name, help=text)
     return parser
-
-
-def _loaded(names: Iterable[str], absent: dict[str, str]) -> list[Any]:
-    """The functions of commands in the order of their modules' lines; to ``absent``
-    are added those that cannot be loaded, and what to install."""
-    functions = []
-    for name in names:
-        try:
-            functions.append(part(name, name, COMMANDS))
-        except MissingExtraError as error:
-            absent[name] = str(error)
-    return sorted(functions, key=lambda f: (f.__module__, f.__code__.co_firstlineno))
