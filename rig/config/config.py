@@ -26,11 +26,11 @@ PHONE = (
 )  # fmt: skip
 SENSOR = ("names", "unit", "registers", "columns", "factors")
 UP = ("up_x", "up_y", "up_z")  # what a phone on an arm measures
-# Of [motion], [settle] and [session]: may change between a run and its resumption.
-UNMEASURED = (
-    "poll_s", "stall_s", "envelope_margin_deg", "mirror_limits", "timeout_s",
-    "verify_limit_deg", "reference_tolerance_deg", "max_unreachable",
-)  # fmt: skip
+# What of these tables may not change between a run and its resumption.
+MEASURED = {
+    "settle": ("window_s", "min_samples", "std_deg", "slope_deg_s", "samples"),
+    "motion": ("approach_overshoot_deg",),
+}
 
 
 def names_of(described: dict[str, Any]) -> tuple[list[str], list[str]]:
@@ -252,17 +252,12 @@ class RigConfig(Section):
     def changed_since(self, start: dict[str, Any]) -> list[str]:
         """Keys that would make a resumed run measure otherwise, in words; ``start`` is
         the first record of its journal."""
-        changed = differences(start["device"], self.device_fingerprint())
-        described = json.loads(json.dumps(self.described(), default=str))
-        for table in ("motion", "settle", "session"):
-            began = start["config"][table]  # later keys had their defaults in it
-            keys = [key for key in began if key not in UNMEASURED]
-            then, now = (
-                {f"{table}.{key}": values.get(key) for key in keys}
-                for values in (began, described[table])
-            )
-            changed += differences(then, now)
-        return changed
+        then, now = dict(start["device"]), self.device_fingerprint()
+        for table, names in MEASURED.items():
+            for name in names:
+                now[f"{table}.{name}"] = getattr(getattr(self, table), name)
+                then[f"{table}.{name}"] = start["config"][table][name]
+        return differences(then, now)
 
     def device_fingerprint(self) -> dict[str, Any]:
         """Key of rig.toml to value, of all that says which place a pulse count means;
