@@ -241,12 +241,13 @@ class RigConfig(Section):
         return np.asarray(pulses, dtype=np.float64) / scales
 
     def described(self) -> dict[str, Any]:
-        """Every key as JSON, as the journal keeps it; of a map its name."""
-        data = self.model_dump(exclude={"output", "device"})
+        """Every key as JSON, as the journal keeps it; maps are in the fingerprint."""
+        no_maps = {"__all__": {"map"}}
+        data = self.model_dump(
+            exclude={"output": True, "device": True, "axes": no_maps}
+        )
         # Those left out too.
         data["session"] |= {"ranges": self.ranges, "k": self.k, "method": self.method}
-        for axis, described in zip(self.axes, data["axes"], strict=True):
-            described["map"] = {"name": axis.map.name}
         return data
 
     def changed_since(self, start: dict[str, Any]) -> list[str]:
