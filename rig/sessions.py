@@ -92,7 +92,8 @@ def _procedure(
     )
     if mode == "verify":
         return lambda run: verify.verify(run, calibration, inputs["count"]), kept, []
-    doubts = verify.doubts(calibration)
+    verdict = calibration.provenance.get("notes", {}).get("verdict", {})  # from 0.3 on
+    doubts = list(verdict.get("reasons", ()))
     return lambda run: verify.goto(run, calibration, inputs["to"]), kept, doubts
 
 

@@ -65,12 +65,6 @@ def load_calibration(
     return calibration, kept
 
 
-def doubts(calibration: Any) -> list[str]:
-    """Why its session said not to use a calibration; one made before 0.3 says none."""
-    verdict = calibration.provenance.get("notes", {}).get("verdict", {})
-    return list(verdict.get("reasons", ()))
-
-
 def verify(run: Run, calibration: Any, count: int) -> int:
     """Fresh held-out postures against a saved calibration: is it still true?"""
     config = run.config
