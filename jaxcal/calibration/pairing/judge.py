@@ -1,9 +1,7 @@
 """Whether readings belong to the commands beside them, and how a table was mispaired.
 
-The commonest fault of a logged calibration is a reading that was lost: all later ones
-stand beside the command before theirs. ``mispairing`` looks for that and its kin, and
-names one where it explains the readings far better than the table as it stands and than
-what machines do: outliers, drift, a curve that the model lacks.
+A mispairing is named where it explains the readings far better than the table as it
+stands and than what machines do: outliers, drift, a curve that the model lacks.
 """
 
 from __future__ import annotations
@@ -16,15 +14,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.calibration.pairing.fit import Fitted, fits_of, fitted, top
-from jaxcal.calibration.pairing.table import (
+from jaxcal.calibration.pairing.fit import (
     FOREIGN,
     ColumnChange,
+    Fitted,
     Hypothesis,
     Rows,
     Table,
     as_it_is,
+    fits_of,
+    fitted,
     path_match,
+    top,
 )
 from jaxcal.calibration.verdict import froze
 from jaxcal.checks import Array
@@ -107,7 +108,7 @@ def _taken_up(fit: Fit) -> Mispairing | None:
     """A unit, a sign or a place that a nonlinear fit took up in its parameters."""
     if fit.stated_prior is not None and not fit.prior_precision.any():
         return None  # its mean is where a search starts, no machine
-    from jaxcal.calibration.pairing.columns import by_nominal
+    from jaxcal.calibration.pairing.rearranged import by_nominal
 
     table = of_fit(fit)
     nominal = table and by_nominal(table, fit.input_names, fit.output_names)
@@ -219,7 +220,8 @@ def _found(
     if (plain.rms <= _EXACT * table.width).all():
         return None
     # Loaded, here and below, only where a table is in doubt.
-    from jaxcal.calibration.pairing.columns import changed_columns
+    from jaxcal.calibration.pairing.rearranged import changed_columns, polished
+    from jaxcal.calibration.pairing.words import sentence, what_is_wrong
 
     fits = [fit for fit in _alternatives(table, plain) if not _few(fit)]
     if not any(_explains(plain, fit) for fit in fits):
@@ -241,9 +243,6 @@ def _found(
             by_itself = benign is not plain and not benign.hypothesis.code
             if by_itself and not better(benign, best, _BENIGN):
                 return None
-    from jaxcal.calibration.pairing.orders import polished
-    from jaxcal.calibration.pairing.words import sentence, what_is_wrong
-
     near: dict[int, list[int]] = {}
     if best.hypothesis.kind == "path":
         with contextlib.suppress(ValueError):
@@ -255,11 +254,8 @@ def _found(
         if shifts:
             rivals[rivals.index(shifts[0])], best = best, shifts[0]
     reason = sentence(table, best, near, outputs, unit)
-    others: list[str] = []
-    for fit in rivals:
-        other = what_is_wrong(table, fit, {}, outputs, unit)
-        if other not in reason and other not in others and len(others) < _NAMED:
-            others.append(other)
+    named = [what_is_wrong(table, fit, {}, outputs, unit) for fit in rivals]
+    others = [*dict.fromkeys(x for x in named if x not in reason)][:_NAMED]
     match = best.hypothesis.match
     if best.hypothesis.kind == _APART:
         match = path_match(len(match), best.hypothesis.starts)
@@ -275,10 +271,8 @@ def _found(
 
 
 def _as_good(table: Table, best: Fitted, fits: list[Fitted]) -> list[Fitted]:
-    """Mispairings of another kind that explain the readings as well as the best.
-
-    Rows that a shift leaves unpaired do not speak against it.
-    """
+    """Mispairings of another kind that explain the readings as well as the best; rows
+    that a shift leaves unpaired do not speak against it."""
     noise = np.maximum(best.noise, 1e-300)
     row = float((2.0 + np.log(table.width / noise).clip(0.0)).sum())
     paired = best.hypothesis.match >= 0
@@ -297,10 +291,7 @@ def _as_good(table: Table, best: Fitted, fits: list[Fitted]) -> list[Fitted]:
 
 
 def _plainly_right(fit: Fit) -> bool:
-    """Whether the fit tells neighbours apart, and leaves no row and no trend over.
-
-    Rows that were mispaired are then off by far more than the others.
-    """
+    """Whether the fit tells neighbours apart, and leaves no row and no trend over."""
     off, used = fit.residuals, fit.loss_weights > 0.0
     if not used.all():
         return False
@@ -327,11 +318,8 @@ def _plainly_right(fit: Fit) -> bool:
 
 
 def _white(off: Array, rms: Array, said: Array) -> bool:
-    """Whether many residuals of a fit that explains the readings are independent.
-
-    Neighbours that noise hides leave a trace only together: a lag or a block of rows
-    from elsewhere makes residuals in a row alike, or larger than the others.
-    """
+    """Whether many residuals of a fit that explains the readings are independent: a lag
+    or a block from elsewhere makes those in a row alike, or larger than the others."""
     count = len(off)
     if count < _MANY or (rms > 0.5 * said.std(axis=0)).any():
         return False
@@ -376,11 +364,8 @@ def _chance(outliers: int, width: int, count: int) -> float:
 
 
 def _apart(table: Table, plain: Fitted) -> list[Fitted]:
-    """Outliers that are one block of rows, as those of none are.
-
-    A reading from elsewhere may agree with its command by chance, and one outlier may
-    stand apart.
-    """
+    """Outliers that are one block of rows, as those of none are, but for the first or
+    the last: one outlier may stand apart."""
     count = len(table.commands)
     outliers = np.flatnonzero(~plain.inside & table.counted)
     for rows in (outliers, outliers[1:], outliers[:-1]):
@@ -411,8 +396,7 @@ def _explains(plain: Fitted, fit: Fitted) -> bool:
 
 def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     """Other pairings of rows, fitted."""
-    from jaxcal.calibration.pairing.columns import places
-    from jaxcal.calibration.pairing.orders import exchanged, polished, sorted_alone
+    from jaxcal.calibration.pairing.rearranged import places, polished, sorted_alone
     from jaxcal.calibration.pairing.search import ranked
 
     tables = [table]
@@ -432,7 +416,7 @@ def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     for path in top(paths, 2):
         with contextlib.suppress(ValueError):
             fits.append(polished(table, path)[0])
-    for search in (_apart, exchanged, sorted_alone):
+    for search in (_apart, sorted_alone):
         with contextlib.suppress(ValueError):
             fits += search(table, plain)
     return fits

@@ -1,8 +1,5 @@
-"""Pairings of rows that are tried, and ranked by least squares.
-
-Every change of the pairing at any row is one hypothesis. Its least squares follow from
-sums of normal equations over the rows before and after, so all are solved at once.
-"""
+"""Pairings of rows that are tried, and ranked by least squares: those of a change at
+any row follow from sums of normal equations over the rows before and after."""
 
 from __future__ import annotations
 
@@ -13,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.pairing.fit import log_evidence, solved
-from jaxcal.calibration.pairing.table import (
+from jaxcal.calibration.pairing.fit import (
     AS_IT_IS,
     FOREIGN,
     Hypothesis,
@@ -22,8 +18,10 @@ from jaxcal.calibration.pairing.table import (
     Rows,
     Table,
     as_it_is,
+    log_evidence,
     path_match,
     shifted,
+    solved,
 )
 from jaxcal.checks import Array
 
@@ -159,13 +157,12 @@ def _of_all_rows(
             matches.append(shifted(count, by))
             names.append(("shift", code, ((0, by),)))
     half = count // 2
-    turns = range(1, count) if fast and count <= _EDGES else {half, count - half}
-    for by in turns:
+    near = (1, 2, 3, count - 3, count - 2, count - 1) if fast else ()
+    for by in {half, count - half, *near}:
         halves = by in (half, count - half)
-        near = min(by, count - by) <= 3
-        code = _KINDS + np.log(2.0 if halves else 6.0 if near else count)
+        code = _KINDS + np.log(2.0 if halves else 6.0)
         matches.append((rows + by) % count)
-        kind = "halves" if halves and not near else "rotation"
+        kind = "halves" if halves and half > 3 else "rotation"
         names.append((kind, code, ((0, by if by < half else by - count),)))
     return np.array(matches), names
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.calibration.pairing.fit import fitted, predicted
+from jaxcal.calibration.pairing.fit import as_it_is, fitted, predicted
 from jaxcal.calibration.pairing.judge import (
     LEAST,
     RATIO,
@@ -16,7 +16,6 @@ from jaxcal.calibration.pairing.judge import (
     better,
     of_fit,
 )
-from jaxcal.calibration.pairing.table import as_it_is
 from jaxcal.calibration.verdict import Reason, Verdict, bends, in_rows
 from jaxcal.checks import in_words
 
@@ -60,12 +59,8 @@ def against(verdict: Verdict, fit: Fit, pairing: Mispairing | None) -> Verdict:
 
 
 def _hidden_outliers(fit: Fit) -> Reason | None:
-    """Rows that a fit of the others leaves far off, and least squares does not.
-
-    Where several are off, least squares meets them halfway: its noise grows until none
-    of them is an outlier. A model of which nothing is known before is asked, where
-    drift and curves explain the rows no better.
-    """
+    """Rows that a fit of the others leaves far off, and least squares does not, which
+    meets several halfway: its noise grows until none of them is an outlier."""
     if len(fit.commands) < LEAST or not _uneven(fit):
         return None
     if fit.residuals.size < _READINGS * fit.free.sum():
@@ -99,10 +94,8 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
 
 
 def _uneven(fit: Fit) -> bool:
-    """Whether least absolute residuals would leave rows far off.
-
-    To first order, by a few rounds of least squares whose weights fall with distance.
-    """
+    """Whether least absolute residuals would leave rows far off, to first order, by a
+    few rounds of least squares whose weights fall with distance."""
     from scipy.linalg.lapack import dposv
 
     noise = fit.noise_std

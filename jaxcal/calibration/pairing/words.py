@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from jaxcal.calibration.pairing.fit import Fitted
-from jaxcal.calibration.pairing.table import FOREIGN, Path, Table
+from jaxcal.calibration.pairing.fit import FOREIGN, Fitted, Path, Table
 from jaxcal.checks import in_words
+
+_WHOLE = {
+    "reversed": "the readings are in reverse order",
+    "commands sorted": "the commands are sorted and the readings are not",
+    "readings sorted": "the readings are sorted and the commands are not",
+}
 
 
 def sentence(
@@ -39,31 +42,19 @@ def what_is_wrong(
         return hypothesis.change.words
     if kind == "shift":
         return f"all readings are {_rows_late(starts[0][1])}"
-    if kind == "reversed":
-        return "the readings are in reverse order"
+    if kind in _WHOLE:
+        return _WHOLE[kind]
     if kind == "halves":
         return (
             "the halves of the readings are exchanged: the readings from row "
             f"{-starts[0][1] % count} on belong to the first commands"
         )
-    if kind == "rotation" and abs(starts[0][1]) <= count // 3:
+    if kind == "rotation":
         last, far = "first" if starts[0][1] > 0 else "last", abs(starts[0][1])
         these = f"{last} {far} are" if far > 1 else f"{last} is"
         return (
             f"all readings are {_rows_late(starts[0][1])}; the {these} at the other end"
         )
-    if kind == "rotation":
-        return (
-            f"the readings from row {-starts[0][1] % count} on belong to the first "
-            "commands, the readings before it to the last"
-        )
-    if kind == "commands sorted":
-        return "the commands are sorted and the readings are not"
-    if kind == "readings sorted":
-        return "the readings are sorted and the commands are not"
-    if kind == "exchanged":
-        rows = np.flatnonzero(hypothesis.match != np.arange(count))
-        return f"the readings of rows {', '.join(map(str, rows))} are exchanged"
     if kind in ("offset", "parameters"):
         another = "slope or offset"
         if kind == "offset":

@@ -1,0 +1,379 @@
+"""Columns and rows that were rearranged: another sign, unit, place or order."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxcal.calibration.pairing.fit import (
+    ColumnChange,
+    Fitted,
+    Hypothesis,
+    Rows,
+    Table,
+    as_it_is,
+    fits_of,
+    fitted,
+    path_match,
+    predicted,
+    shifted,
+    solved,
+)
+from jaxcal.checks import Array
+from jaxcal.models.predictions import predict
+
+_RADIAN = 1.7453292519943295e-2  # a degree in radians
+_UNITS = {
+    "is in radians instead of degrees": 1.0 / _RADIAN,
+    "is in degrees instead of radians": _RADIAN,
+    "is too small by 1000 (m for mm?)": 1000.0,
+    "is too large by 1000 (mm for m?)": 0.001,
+    "is too small by 10": 10.0,
+    "is too large by 10": 0.1,
+    "is too small by 100": 100.0,
+    "is too large by 100": 0.01,
+}
+_DECADES = {0.01, 0.1, 10.0, 100.0}  # by which a nominal may be off
+_COLUMNS = 6  # changes of columns that are fitted one by one
+_MOST = 30  # columns that are tried one by one
+_PLACES = 2  # of a sensor, that are tried
+_KINDS = np.log(10.0)
+_ROWS = 50  # that are predicted in each unit
+_FACTOR, _LEFT_OVER = 1.5, 0.6  # between machine and nominal; of the readings' squares
+_MOST_ROWS = 150  # of a table whose lost order is looked for
+_STARTS, _REFINED, _ROUNDS = 12_000, 8, 12  # of that search: rows times starts, ...
+_SOLVED = 0.003  # share of the squares that the right order leaves
+_FAR = 1e9  # noises: what a model cannot predict
+_TURNS = 6  # of assigning readings and fitting
+
+
+def changed_columns(
+    table: Table, plain: Fitted, inputs: Sequence[str], outputs: Sequence[str]
+) -> list[Fitted]:
+    """Columns with another sign, unit or place."""
+    least = 0.1 if table.model.resolution else 0.02
+    if table.shared or not (plain.rms > least * table.width).any():
+        return []
+    tables, every = [], np.flatnonzero(table.counted)
+    for hypothesis in _kinds_of_columns(table, inputs, outputs):
+        anew = _anew(table, hypothesis, every)
+        with contextlib.suppress(ValueError):  # the number of a chain has no sign
+            if anew is not None:
+                tables.append((_distance(anew, hypothesis, every), anew, hypothesis))
+    tables.sort(key=lambda row: row[0])
+    return [
+        fit
+        for _, anew, hypothesis in tables[:_COLUMNS]
+        for fit in fits_of(anew, [hypothesis])
+    ]
+
+
+def by_nominal(
+    table: Table, inputs: Sequence[str], outputs: Sequence[str]
+) -> Fitted | None:
+    """A change by which the prior's mean explains readings that it does not without: a
+    nonlinear fit may take up a unit or a sign in a parameter."""
+    rows = np.flatnonzero(table.counted)[:_ROWS]
+    if (_unexplained(table, as_it_is(table), rows) < 1.0).all():
+        return None
+    kinds = [
+        hypothesis
+        for hypothesis in _kinds_of_columns(table, inputs, outputs)
+        if hypothesis.change and _DECADES.isdisjoint(hypothesis.change.factors)
+    ]
+    if not kinds:
+        return None
+    shares = [_unexplained(table, hypothesis, rows) for hypothesis in kinds]
+    best = min(range(len(kinds)), key=lambda i: shares[i].sum())
+    if (shares[best] >= _LEFT_OVER).any():
+        return None
+    nominal = dataclasses.replace(table, theta=table.mean)
+    for fit in fits_of(nominal, [kinds[best]]):  # whose parameters are near it
+        near = np.abs(fit.theta - table.mean) <= np.abs(table.mean)
+        if near[table.mean != 0.0].all():
+            return fit
+    return None
+
+
+def _unexplained(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
+    """(q,) share of the readings' squares about their means left by the prior's mean,
+    whose outputs may be larger or smaller by a factor."""
+    readings = table.readings_of(hypothesis, rows)
+    commands = table.commands_of(hypothesis, rows)
+    outputs = predict(table.model, commands, table.mean, finite=False)
+    with np.errstate(all="ignore"):
+        ratio = (readings * outputs).sum(axis=0) / (outputs**2).sum(axis=0)
+        off = readings - outputs * np.clip(ratio, 1.0 / _FACTOR, _FACTOR)
+        off = table.model.wrapped(off, commands)
+        share = (off**2).sum(axis=0) / (readings.var(axis=0) * len(rows))
+    return np.nan_to_num(share, nan=np.inf, posinf=np.inf)
+
+
+def _kinds_of_columns(
+    table: Table, inputs: Sequence[str], outputs: Sequence[str]
+) -> list[Hypothesis]:
+    """Columns with another sign or unit, or in the place of another's."""
+    moved = table.commands.shape[1] - table.sensed
+    tables = [(inputs, len(inputs), moved, False)]
+    if not table.model.relative:
+        tables.append((outputs, len(outputs), len(outputs), True))
+    # A machine that hardly moves has zero readings everywhere, as contacts.
+    units = _UNITS if table.measured.any() else {}
+    changes: list[ColumnChange] = []
+    for names, size, count, of_readings in tables:
+        if of_readings and not table.measured.any():
+            continue
+        kinds: list[tuple[str, list[int], float]] = []  # words, columns and factor
+        singly = range(count if count <= _MOST else 0)  # no trajectory's readings
+        for i in singly:
+            for what, factor in {"has the other sign": -1.0, **units}.items():
+                kinds.append((f"{names[i]} {what}", [i], factor))
+        side = "the readings" if of_readings else "the commands"
+        for what, factor in units.items() if count > 1 else ():
+            every = f"every column of {side} {what}"
+            kinds.append((every, [*range(count)], factor))
+        for i, j in itertools.combinations(singly, 2):
+            both = f"{names[i]} and {names[j]}"
+            kinds.append((f"{both} are exchanged", [i, j], 1.0))
+            if not of_readings:
+                kinds.append((f"{both} have the wrong sign", [i, j], -1.0))
+        for words, columns, factor in kinds:
+            order, factors = np.arange(size), np.ones(size)
+            factors[columns] = factor
+            if factor == 1.0:  # exchanged
+                order[columns] = columns[::-1]
+            places = tuple(order.tolist()), tuple(factors.tolist())
+            changes.append(ColumnChange(words, of_readings, *places))
+    code, several = _KINDS + np.log(len(changes) + 1.0), np.log(20.0)
+    rows = np.arange(len(table.commands))
+    costs = [
+        several * (" and " in x.words) + _KINDS * ("every" in x.words) for x in changes
+    ]
+    return [
+        Hypothesis("columns", rows, code + cost, change=x)
+        for x, cost in zip(changes, costs, strict=True)
+    ]
+
+
+def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
+    """Log size of what is off before anything is fitted that a prior is known of."""
+    off = table.residuals(hypothesis, rows, table.theta)
+    if table.flat:
+        with contextlib.suppress(ValueError):  # least squares about ``theta``
+            slopes, right = table.system(hypothesis, rows)
+            flat = slopes.reshape(-1, slopes.shape[-1])
+            aim = flat.T @ right.reshape(len(flat), -1)
+            solution = solved(flat.T @ flat, aim, table.ridge(flat.shape[1]))
+            off = np.asarray((right - slopes @ solution).reshape(len(rows), -1))
+    size = float(np.log(np.median(np.abs(off), axis=0) + 1e-300).sum())
+    if hypothesis.change is not None:
+        size -= hypothesis.change.log_size
+    return size if size == size else np.inf
+
+
+def _anew(table: Table, hypothesis: Hypothesis, rows: Rows) -> Table | None:
+    """The table of the machine that these readings show if the hypothesis holds."""
+    if not table.free.any():
+        return table
+    try:
+        model = table.model.anew(
+            table.commands_of(hypothesis, rows), table.readings_of(hypothesis, rows)
+        )
+    except ValueError:
+        return None
+    mean = table.mean + np.asarray(model.nominal) - table.model.nominal
+    return dataclasses.replace(table, model=model, mean=mean, theta=mean)
+
+
+def places(table: Table) -> list[Table]:
+    """The table with its sensor where some rows, or some pairing of them, put it, those
+    that fit best first: mispaired readings together put it nowhere."""
+    count = len(table.commands)
+    every, half = np.arange(count), count // 2
+    windows = [(every, every), (every, every[:half]), (every, every[half:])]
+    matches = [shifted(count, by) for by in (1, -1, 2, -2, 3, -3)]
+    matches += [every[::-1], (every + half) % count, (every - half) % count]
+    windows += [(match, every) for match in matches]
+    ranked = []
+    for match, rows in windows:
+        hypothesis = Hypothesis("", match)
+        rows = rows[(match[rows] >= 0) & table.counted[rows]]
+        anew = _anew(table, hypothesis, rows)
+        if anew is not None:
+            ranked.append((_distance(anew, hypothesis, rows), anew))
+    ranked.sort(key=lambda pair: pair[0])
+    return [anew for _, anew in ranked[:_PLACES]] or [table]
+
+
+def polished(table: Table, fit: Fitted) -> tuple[Fitted, dict[int, list[int]]]:
+    """A path with its changes at their most probable rows, and rows about as good."""
+    path = list(fit.hypothesis.starts)
+    near: dict[int, list[int]] = {}
+    count, costs = len(table.commands), table.costs()
+    noise = np.maximum(fit.noise, 1e-7)
+    for _ in range(2):
+        of_rows: dict[int, Array] = {}
+        for by in {shift for _, shift in path}:
+            cost = costs.copy()
+            match = path_match(count, [(0, by)])
+            rows = np.flatnonzero((match >= 0) & table.counted)
+            if len(rows):
+                off = _off(table, fit, match, rows) / noise
+                inside = 0.5 * (off**2).sum(axis=1) + np.log(noise).sum()
+                inside += 0.5 * table.outputs * np.log(2.0 * np.pi)
+                cost[rows] = np.minimum(inside, costs[rows] + np.log(20.0))
+            of_rows[by] = cost * table.counted
+        near = {}
+        for i in range(1, len(path)):
+            low = path[i - 1][0] + 1
+            high = path[i + 1][0] if i + 1 < len(path) else count
+            gain = of_rows[path[i - 1][1]] - of_rows[path[i][1]]
+            upto = np.append(0.0, np.cumsum(gain))[low:high]
+            best = int(upto.argmin())
+            near[i] = [low + int(k) for k in np.flatnonzero(upto < upto[best] + 2.0)]
+            path[i] = (low + best, path[i][1])
+        if tuple(path) == fit.hypothesis.starts:
+            break
+        match = path_match(count, path)
+        fit = fitted(
+            table,
+            dataclasses.replace(fit.hypothesis, match=match, starts=tuple(path)),
+            fit.theta,
+        )
+        noise = np.maximum(fit.noise, 1e-7)
+    return fit, near
+
+
+def _off(table: Table, fit: Fitted, match: Rows, rows: Rows) -> Array:
+    """(K, q) residuals of rows paired by ``match``, in scales, at the fit."""
+    if table.shared:
+        reading = table.measured[rows] / table.scale
+        return np.asarray(reading - predicted(table, fit)[match[rows]])
+    return table.residuals(Hypothesis("", match), rows, fit.theta)
+
+
+def assigned(table: Table, fit: Fitted, rows: Rows) -> Rows:
+    """(N,) match in which readings of ``rows`` have those commands that fit best."""
+    from scipy.optimize import linear_sum_assignment
+
+    match = fit.hypothesis.match.copy()
+    commands = match[rows]
+    noise = np.maximum(fit.noise, 1e-7)
+    off = table.measured[rows, None] / table.scale - predicted(table, fit)[commands]
+    apart = np.minimum(np.nan_to_num(off / noise, nan=_FAR), _FAR) ** 2
+    reading, other = linear_sum_assignment(apart.sum(axis=-1))
+    match[rows[reading]] = commands[other]
+    return match
+
+
+def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
+    """Commands or readings that were sorted without the others."""
+    count = len(table.commands)
+    poor = (plain.rms > 0.3 * table.width).any()
+    if table.sensed or not poor or count > _MOST_ROWS:
+        return []
+    kinds = []
+    if _in_order(table.commands, 0.1):  # as levels, of which many rows have one
+        code = 2.3 + float(np.log(np.arange(1, count + 1)).sum())
+        kinds.append(("commands sorted", code))
+    if _in_order(table.measured, 0.7):  # by chance noise is in no order
+        kinds.append(("readings sorted", 5.0 * np.log(count)))
+    if not kinds:
+        return []
+    expected = dataclasses.replace(table, theta=table.mean)
+    fits = [_matched(table, match) for match in matched_anew(expected, plain)]
+    return [
+        fit._replace(
+            hypothesis=dataclasses.replace(fit.hypothesis, kind=kind, code=code),
+            evidence=fit.evidence - code,
+        )
+        for kind, code in kinds
+        for fit in fits
+    ]
+
+
+def _in_order(side: Array, share: float) -> bool:
+    """Whether a column never falls, or never rises, and moves at enough rows."""
+    way = np.sign(np.diff(side, axis=0))
+    moves = np.abs(way).sum(axis=0) >= share * len(side)
+    return bool((moves & (np.ptp(way, axis=0) < 2)).any())
+
+
+def _matched(table: Table, match: Rows) -> Fitted:
+    """An assignment that is refined in turn with its fit."""
+    hypothesis, every = Hypothesis("sorted", match), np.arange(len(match))
+    fit = fitted(table, hypothesis)
+    for _ in range(_TURNS):
+        match = assigned(table, fit, every)
+        if (match == fit.hypothesis.match).all():
+            break
+        fit = fitted(table, dataclasses.replace(hypothesis, match=match), fit.theta)
+    return fit
+
+
+def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
+    """Matches (N,) by which readings that lost their order fit some parameters best.
+    One output alone is matched by sorting, for many parameters at once, in turn with
+    least squares; the best matches are refined with all outputs by assignment."""
+    from scipy.optimize import linear_sum_assignment
+
+    every = np.arange(len(table.commands))
+    if not table.free.any():
+        return [assigned(table, fit, every)]
+    factors, right = table.system(as_it_is(table), every)
+    (count, a, r), c = factors.shape, right.shape[-1]
+    read = (table.measured / table.scale).reshape(count, -1)
+    fixed = read - right.reshape(count, -1)  # of predictions, by nothing that is free
+    flat = factors.reshape(count * a, r)
+    inverse = np.linalg.pinv(flat)
+    middle = read.mean(axis=0)  # of both, so that squares keep their digits
+    read, fixed = read - middle, fixed - middle
+    all_of_it = (read**2).sum()
+    tried: dict[bytes, tuple[float, Rows]] = {}
+    for k in range(read.shape[1]):
+        for match in _sorted_matches(factors[:, k % a], fixed[:, k], read[:, k]):
+            square = np.inf
+            for _ in range(_ROUNDS):
+                aim = (read[np.argsort(match)] - fixed).reshape(count * a, c)
+                said = fixed + (flat @ (inverse @ aim)).reshape(count, -1)
+                apart = (said**2).sum(axis=1) - 2.0 * read @ said.T
+                better = float(apart[every, match].sum() + all_of_it)
+                if not better < square:
+                    break
+                square, match = better, linear_sum_assignment(apart)[1]
+            tried[match.tobytes()] = square, match
+            if square < _SOLVED * all_of_it:
+                return [match]
+    best = sorted(tried.values(), key=lambda pair: pair[0])[:2]
+    return [match for _, match in best]
+
+
+def _sorted_matches(factors: Array, fixed: Array, read: Array) -> Rows:
+    """(K, N) matches of one output's readings (N,) that fit it best, by factors (N, r)
+    of the commands and what is ``fixed`` (N,) besides."""
+    count = len(read)
+    axes = np.linalg.svd(factors - factors.mean(axis=0), full_matrices=False)[0]
+    into = factors @ np.linalg.pinv(factors)
+    starts = max(_STARTS // count, 60)
+    turns = np.random.default_rng(0).normal(size=(starts, axes.shape[1]))
+    size = read.std() * np.sqrt(count)
+    if fixed.any():  # parameters near those that are expected
+        size *= np.linspace(0.0, 1.0, starts)[:, None] ** 2
+    said = fixed + size * turns @ axes.T / np.sqrt(axes.shape[1])
+    lines, ordered = np.arange(starts)[:, None], np.sort(read)
+    aim = np.empty_like(said)
+    for _ in range(_ROUNDS):
+        aim[lines, np.argsort(said, axis=1)] = ordered
+        said = fixed + (aim - fixed) @ into
+    squares = ((aim - said) ** 2).sum(axis=1)
+    ranks = np.argsort(np.argsort(aim[np.argsort(squares)], axis=1), axis=1)
+    _, first = np.unique(ranks, axis=0, return_index=True)
+    best = ranks[np.sort(first)[:_REFINED]]
+    matches = np.empty_like(best)  # of the reading of a rank, its command
+    by_rank = np.argsort(best, axis=1)
+    matches[:, np.argsort(read, kind="stable")] = by_rank
+    return matches
