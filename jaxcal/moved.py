@@ -27,6 +27,7 @@ MOVED = {  # longer names first
     "jaxcal.learning.settings": "jaxcal.learning.config",
     "jaxcal.learning.training.config": "jaxcal.learning.training.presets",
     "jaxcal.learning.training.imitation": "jaxcal.learning.training.postures",
+    "jaxcal.models.affine": "jaxcal.models.linear",
     "jaxcal.models.sensors.distance": "jaxcal.arms.sensors.landmarks",
     "jaxcal.models.sensors.gravity": "jaxcal.arms.sensors.at_rest",
     "jaxcal.models.sensors.plane": "jaxcal.arms.sensors.landmarks",

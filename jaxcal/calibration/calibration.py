@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-import warnings
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -16,9 +14,9 @@ from jaxcal.calibration import file
 from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
-from jaxcal.calibration.inverse import command_for, no_inverse
+from jaxcal.calibration.inverse import command_for
 from jaxcal.calibration.verdict import Verdict, verdict
-from jaxcal.checks import Array, aligned, in_words
+from jaxcal.checks import aligned, in_words
 from jaxcal.late import late
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
@@ -30,10 +28,8 @@ Path = str | os.PathLike[str]
 
 
 class Calibration(Fit):
-    """The identified map from commands u (n inputs) to outputs y (m of them).
-
-    ``y = f(u; theta)`` with the most probable p parameters; ``print`` shows them with
-    their intervals. ``identify`` returns it; see ``Fit`` for its fields.
+    """The map ``y = f(u; theta)`` from n inputs to m outputs that ``identify`` returns;
+    ``print`` shows its p parameters with their intervals. See ``Fit`` for its fields.
     """
 
     def __repr__(self) -> str:
@@ -41,13 +37,19 @@ class Calibration(Fit):
 
     command_for = command_for
     inverse = late("jaxcal.calibration.of_readings:inverse")
-    no_inverse = no_inverse
     check = late("jaxcal.calibration.check:check")
     budget = late("jaxcal.reports.budget:budget")
     report = late("jaxcal.reports.calibration:report")
     plot = late("jaxcal.reports.shown:plot_calibration")
     _repr_html_ = late("jaxcal.reports.shown:as_html")
     verification = late("jaxcal.calibration.check:verification")
+    of = late("jaxcal.arms.written:of")
+    to_urdf = late("jaxcal.arms.written:to_urdf")
+    to_dh = late("jaxcal.arms.written:to_dh")
+    to_ur_kinematics = late("jaxcal.arms.written:to_ur_kinematics")
+    to_lerobot = late("jaxcal.arms.written:to_lerobot")
+    static_transform = late("jaxcal.arms.transforms:static_transform")
+    to_transform = late("jaxcal.arms.transforms:to_transform")
     to_dict = to_dict
     save = save
 
@@ -80,8 +82,7 @@ class Calibration(Fit):
             lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
             if self.dof < 0.5:
                 lines.append("noise not checked: no residual degrees of freedom")
-        lines += str(self.verdict).splitlines()
-        return "\n".join(lines)
+        return "\n".join([*lines, str(self.verdict)])
 
     def _parameter_rows(self) -> list[tuple[str, ...]]:
         """Cells of the summary's table, its head first: a row for each parameter."""
@@ -109,8 +110,7 @@ class Calibration(Fit):
     @functools.cached_property
     def verdict(self) -> Verdict:
         """Whether the calibration may be used, why not, and what to do next; of an arm
-        with cross-validated errors. The summary, ``report``, exit codes and the warning
-        of ``identify`` use it."""
+        with cross-validated errors."""
         from jaxcal.calibration.pairing import against
 
         own = self.model.verdict(self) or verdict(self)
@@ -126,81 +126,10 @@ class Calibration(Fit):
 
         return mispairing(self)
 
-    def of(self, tip: str) -> Calibration:
-        """The calibration of one of several chains (``jaxcal.models.Chains``), as of an
-        arm of its own, its readings in its own unit."""
-        return dataclasses.replace(self, **self.model.of_chain(self, tip))
-
-    # -- an arm, written back ----------------------------------------------------------
-
     @property
     def arm(self) -> Any:
         """The arm as calibrated, its parameters nominal, with Position()."""
         return self.whole.calibrated(self.estimate)
-
-    def to_urdf(self, path: Path, *, force: bool = False) -> str:
-        """Write the arm's own file, corrected; returns the tip link.
-
-        Files cannot hold compliance and gear harmonics. Without compliance the arm is
-        moved as a whole so that its tip agrees best with the calibration's over its
-        range; without harmonics only, the rest is fitted again. A warning says by how
-        much they differ.
-        """
-        return self.model.write("urdf", path, self._for_file(), force=force)
-
-    static_transform = late("jaxcal.arms.transforms:static_transform")
-    to_transform = late("jaxcal.arms.transforms:to_transform")
-
-    def to_dh(self, path: Path, *, force: bool = False) -> None:
-        """Write the DH table as CSV, corrected as ``to_urdf`` says."""
-        self.model.write("dh", path, self._for_file(), force=force)
-
-    def to_ur_kinematics(self, path: Path, *, force: bool = False) -> None:
-        """Write Universal Robots' kinematics file, corrected as ``to_urdf`` says."""
-        self.model.write("ur", path, self._for_file(), force=force)
-
-    def to_lerobot(
-        self,
-        path: Path,
-        servos: Path,
-        *,
-        names: Mapping[str, str] | None = None,
-        force: bool = False,
-    ) -> dict[str, int]:
-        """Write LeRobot's calibration file of a servo arm with corrected zeros.
-
-        The readings are fitted again by zeros of the joints only, as in such a file; a
-        warning gives the error. See ``jaxcal.models.Servos``. Do not also use a
-        corrected URDF file: it would apply the zeros twice.
-
-        Args:
-            path: the file to write.
-            servos: the file that the postures were read with.
-            names: motors not named as the joints: {"Rotation": "shoulder_pan"}.
-            force: overwrite an existing file.
-
-        Returns:
-            Steps by which the middle of each motor's range moved.
-        """
-        plain: Any = self.model.writable()
-        zeros = [name for name in plain.names if name.startswith("theta")]
-        tool = [name for name in plain.names if "tool" in name]
-        fitted = (*zeros, *plain.sensor.names, *tool)
-        prior = plain.default_prior()
-        held = tuple(name for name in plain.names if name not in fitted)
-        fixed = tuple(dict.fromkeys((*prior.fixed, *held)))
-        again = self.again(plain, dataclasses.replace(prior, fixed=fixed))
-        steps: dict[str, int] = plain.write_servos(
-            path, again.parameters, servos, names or {}, force=force
-        )
-        if again.noise_std is not None:
-            verdict: Any = again.verdict
-            warnings.warn(
-                "the file corrects the zeros of the joints only: cross-validated error "
-                f"{verdict.held_out:.3g}, before calibration {verdict.nominal:.3g}",
-                stacklevel=2,
-            )
-        return steps
 
     def again(
         self, model: Any, prior: Prior | None, rows: NDArray[np.bool_] | None = None
@@ -222,40 +151,6 @@ class Calibration(Fit):
         origin = {k: v for k, v in self.provenance.items() if k not in ours}
         fields["provenance"] = origin | fields["provenance"]
         return dataclasses.replace(self, **fields)
-
-    def _for_file(self) -> Array:
-        """(p,) for a file: without what no file holds; a warning gives the effect."""
-        plain, parameters = self.model.writable(), np.array(self.parameters)
-        held = np.isin(self.names, plain.names)
-        if held.all() and not self.estimate[len(self.names) :].any():
-            return parameters
-        unit = f" {self.measured_unit}" if self.measured_unit else ""
-        errors = ""
-        if held.all():
-            change = "it was fitted without harmonics"
-            again = self.again(plain, plain.default_prior())
-            parameters = again.parameters
-            off = again.outputs_at(self.commands) - self.outputs_at(self.commands)
-            if again.noise_std is not None and self.noise_std is not None:
-                verdicts: tuple[Any, Any] = again.verdict, self.verdict
-                errors = (
-                    f"; cross-validated error {verdicts[0].held_out:.3g}{unit}, of the "
-                    f"calibration {verdicts[1].held_out:.3g}"
-                )
-        else:
-            change = "the arm in it was moved as a whole"
-            parameters = np.where(held, parameters, 0.0)
-            parameters = self.model.standing_as(self.arm, parameters, self.commands)
-            file = self.model.calibrated(parameters)
-            joints = self.commands[:, : file.num_inputs]
-            off = file.predict(joints) - self.arm.predict(joints)
-        warnings.warn(
-            f"the file cannot hold compliance and gear harmonics; {change}: at the "
-            "measured postures its predictions differ from the calibration's by "
-            f"{np.linalg.norm(off, axis=1).mean():.3g}{unit} on average{errors}",
-            stacklevel=3,
-        )
-        return parameters
 
     # -- from a file -------------------------------------------------------------------
 

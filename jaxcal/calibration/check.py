@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.change_tests import ALARMS, ChangeTests, LevelTests
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.pairing import of_new_readings
 from jaxcal.checks import Array, array_of, by_unit, whole_number
@@ -19,6 +18,11 @@ from jaxcal.models.model import recorded
 from jaxcal.models.recording import Recording
 from jaxcal.tables import say_order
 
+_ALARMS = 0.05  # share of false alarms
+_POWER = 0.8
+_KNOWN = 1e9  # degrees of freedom of noise that was given
+_RATIOS = 16  # quantiles of how far noise that was estimated is off
+_HALVINGS = 26  # of a search for the smallest change
 _DRIFT = 10.0  # standard deviations of the prior: no parameter drifts by more
 _MANY = 1000.0  # rows; advice to measure as many or more is not given
 _BLIND = 0.01  # of a parameter's effect, what is left of it where it cannot be seen
@@ -59,9 +63,8 @@ class Check:
         text = f"the calibration {self.says}"
         if self.says == "cannot be told":
             text = "inconclusive: too few readings"
-        tolerances = self.tolerances or {self.unit: self.tolerance}
-        changes = (f"{size:.3g} {unit}".strip() for unit, size in tolerances.items())
-        change = " or ".join(changes)
+        tolerances = (self.tolerances or {self.unit: self.tolerance}).items()
+        change = " or ".join(f"{size:.3g} {unit}".strip() for unit, size in tolerances)
         text += (
             f" (p = {self.p_value:.3g}, false alarms 5 %); the check would detect a "
             f"change of {change} (power {self.power:.0%})"
@@ -115,12 +118,11 @@ def check(
     Args:
         calibration: what is checked.
         commands: (N, n), or for an arm a ``Recording`` or its path.
-        measured: (N, m) readings there; not needed for contacts and recordings that
-            have them.
+        measured: (N, m) readings; not needed for contacts and recordings with readings.
         tolerance: how far, root mean square over the calibration's commands, the
             outputs may drift: a number in the unit of the first (lengths of a pose), or
             of each unit, {"mm": 0.5, "deg": 0.1}. By default three standard deviations
-            of these measurements: the noise and what the calibration does not know.
+            of these measurements.
         placed_anew: for an arm: sockets, planes, anchors or the board were moved since
             the calibration. Parameters that cannot be separated from that, such as the
             first joint's zero, are named (``blind``) and not checked.
@@ -155,20 +157,19 @@ def check(
     # What is seen grows with the root of the rows.
     enough = len(commands) * float((size[hidden] / change[hidden]).max(initial=0)) ** 2
     slipped = ""
-    if p_slip < ALARMS:
+    if p_slip < _ALARMS:
         most = int(np.abs(changes_of_slips).argmax())
-        if _explains(changes_of_slips[most], off.white, tests):
+        rest = np.array([off.white @ off.white - changes_of_slips[most] ** 2])
+        others = LevelTests(np.array([len(off.white) - 1]), tests.whole.dof)
+        if len(off.white) > 1 and others.p_value(rest) >= _ALARMS:
             slip = changes_of_slips[most] / slopes_of_slips[most]
             at = np.flatnonzero(slips)[most]
             unit = calibration.model.units_for("", calibration.measured_unit)[at]
             slipped = f"{names[at]} by {slip:.2g} {unit}"
-    if p_value < ALARMS:
-        says = "does not hold"
-    else:
-        says = "cannot be told" if hidden.any() or not free.any() else "holds"
-    mispaired = None
-    if says == "does not hold" and not placed_anew:
-        mispaired = of_new_readings(calibration, commands, measured)
+    says = "cannot be told" if hidden.any() or not free.any() else "holds"
+    says = "does not hold" if p_value < _ALARMS else says
+    doubted = says == "does not hold" and not placed_anew
+    mispaired = of_new_readings(calibration, commands, measured) if doubted else None
     units = ["" if unit == "length" else unit for unit in tolerances]
     return Check(
         says=says,
@@ -186,12 +187,102 @@ def check(
     )
 
 
-def _explains(change: float, white: Array, tests: ChangeTests) -> bool:
-    """Whether a slip that changes readings (R,) so much leaves nothing unusual."""
-    if len(white) < 2:
-        return False
-    others = LevelTests(np.array([len(white) - 1]), tests.whole.dof)
-    return others.p_value(np.array([white @ white - change**2])) >= ALARMS
+@dataclasses.dataclass(frozen=True)
+class LevelTests:
+    """An F test of whitened readings for each of G levels of noise (chi-square where it
+    is known), of which the least p-value counts (Sidak); and their power."""
+
+    counts: NDArray[np.intp]  # (G,) readings of each level
+    dof: float  # of the noise of a level
+    least: float = 1.0  # mean square of a reading without a change; 1 in the test
+    alarms: float = _ALARMS  # share of false alarms
+
+    def p_value(self, squares: Array) -> float:
+        """Chance of sums (G,) of squared readings at least this large, unchanged."""
+        from scipy import special
+
+        of_levels = special.fdtrc(self.counts, self.dof, squares / self.counts)
+        return float(-np.expm1(len(self.counts) * special.log1p(-of_levels.min())))
+
+    def power(self, shifts: Array) -> Array:
+        """(...,) chance that changes with noncentralities (..., G) are seen. The
+        squared estimate of a noise over the true variance is a chi-square / dof."""
+        from scipy import special
+
+        alarms = -np.expm1(np.log1p(-self.alarms) / len(self.counts))  # of each level
+        limit = special.fdtri(self.counts, self.dof, 1.0 - alarms) / self.least
+        ratio = np.ones(1)
+        if self.dof < _KNOWN:
+            chance = (np.arange(_RATIOS) + 0.5) / _RATIOS
+            ratio = special.gammaincinv(self.dof / 2.0, chance) * 2.0 / self.dof
+        shifts = np.asarray(shifts) / self.least
+        counts, limit = (np.broadcast_to(v, shifts.shape) for v in (self.counts, limit))
+        missed = np.full(shifts.shape, 1.0 - alarms)
+        moved = (shifts > 0.0) | (self.least != 1.0)
+        of_ratios = special.chndtr(
+            (limit * counts)[moved, None] * ratio,
+            counts[moved, None],
+            shifts[moved, None] * ratio,
+        )
+        missed[moved] = np.nan_to_num(of_ratios, nan=0.0).mean(axis=-1)  # too large
+        return np.asarray(1.0 - missed.prod(axis=-1))
+
+    def smallest(self, seen: Array) -> Array:
+        """(p,) changes that are seen with the power asked for, inf where none is, by
+        noncentralities ``seen`` (p, G) of a change by one."""
+        total = seen.sum(axis=1, keepdims=True)
+        shares = np.divide(seen, total, out=np.ones_like(seen), where=total > 0.0)
+        shares, of_share = np.unique(shares.round(12), axis=0, return_inverse=True)
+        low, high = np.zeros((2, len(shares), 1))
+        high += 1.0
+        while (
+            short := (self.power(high * shares) < _POWER)[:, None] & (high < 1e12)
+        ).any():
+            low, high = np.where(short, high, low), np.where(short, 4.0 * high, high)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            short = (self.power(middle * shares) < _POWER)[:, None]
+            low, high = np.where(short, middle, low), np.where(short, high, middle)
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.sqrt(high[of_share.ravel()] / total)[:, 0])
+
+
+class ChangeTests:
+    """A test of all readings, and one of each slip, the largest of which counts; each
+    kind has half of the false alarms."""
+
+    def __init__(
+        self, counts: NDArray[np.intp], calibration: Fit, slips: int, least: float = 1.0
+    ) -> None:
+        half = -np.expm1(np.log1p(-_ALARMS) / 2.0)
+        dof, one = calibration.noise_dof or _KNOWN, np.ones(1, dtype=np.intp)
+        of_each = -np.expm1(np.log1p(-half) / max(1, slips))
+        self.whole = LevelTests(counts, dof, least, half if slips else _ALARMS)
+        self.slip = LevelTests(one, dof, least, of_each)
+        self.count = slips
+
+    def p_values(self, squares: Array, of_slips: Array) -> tuple[float, float]:
+        """Chances of both kinds and of slips alone, by sums (G,), squares (S,)."""
+        whole = self.whole.p_value(squares)
+        if not self.count:
+            return whole, 1.0
+        of_one = self.slip.p_value(of_slips.max(keepdims=True))
+        of_any = 1.0 - (1.0 - of_one) ** self.count
+        return 1.0 - (1.0 - min(whole, of_any)) ** 2, 1.0 - (1.0 - of_any) ** 2
+
+    def power(self, shifts: Array, along: Array) -> Array:
+        """(...,) at least, of noncentralities (..., G) in all, (...,) along a slip."""
+        whole = self.whole.power(shifts)
+        if not self.count:
+            return whole
+        return np.maximum(whole, self.slip.power(along[..., None]))
+
+    def smallest(self, seen: Array, along: Array) -> Array:
+        """(p,) changes that are seen with the power asked for, by either."""
+        whole = self.whole.smallest(seen)
+        if not self.count:
+            return whole
+        return np.minimum(whole, self.slip.smallest(along[:, None]))
 
 
 class _Deviations(NamedTuple):
@@ -235,8 +326,7 @@ def _deviations(
 
 
 def _taken_up(calibration: Fit, placed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(p,) parameters that do nothing but what moving the ``placed`` (p,) ones does, at
-    the calibration's postures: at a few alike any parameter would be one."""
+    """(p,) parameters that do nothing but what moving the ``placed`` (p,) ones does."""
     at = calibration.commands, calibration.parameters
     by = np.asarray(calibration.model.jacobian(*at))
     by = (by / np.asarray(calibration.noise_std)[:, None]).reshape(-1, by.shape[-1])
@@ -362,18 +452,14 @@ def verification(
     *,
     tolerance: float | Mapping[str, float] | None = None,
 ) -> NDArray[np.int64]:
-    """Choose the k candidates that best detect a wrong calibration.
-
-    Greedy, then swaps, for the mean power of the check that follows.
+    """(k,) indices of the candidates that best detect a wrong calibration: greedy, then
+    swaps, for the mean power of the check that follows.
 
     Args:
         calibration: what is checked.
         candidates: (M, n) commands that could be measured.
         k: three or four are as good as six random ones.
         tolerance: the drift to detect, as in ``check``.
-
-    Returns:
-        (k,) indices.
     """
     points = _postures(calibration, "candidates", candidates)
     if not 1 <= whole_number("k", k, 1) <= len(points):
@@ -394,23 +480,15 @@ def verification(
     counts = of_level.sum(axis=1)
     slips = np.isin(calibration.names, calibration.model.slips)[judged]
 
-    def value(rows: list[int]) -> Array:
-        """(M,) of the rows and each candidate."""
-        shift = shifts[rows].sum(axis=0) + shifts
-        tests = ChangeTests(counts * (len(rows) + 1), calibration, int(slips.sum()))
-        return np.asarray(tests.power(shift, slips * shift.sum(axis=-1)).mean(axis=-1))
-
-    return np.array(_best_rows(value, k))
-
-
-def _best_rows(value: Callable[[list[int]], Array], k: int) -> list[int]:
-    """k rows by greedy choice, then by swaps; ``value`` (M,) of some with each."""
     chosen: list[int] = []
     for turn in range(1 + _SWEEPS):
         before = list(chosen)
         for at in range(k):
             rest = chosen[:at] + chosen[at + 1 :]
-            gains = value(rest)
+            shift = shifts[rest].sum(axis=0) + shifts  # of these and each candidate
+            tests = ChangeTests(counts * (len(rest) + 1), calibration, int(slips.sum()))
+            power = tests.power(shift, slips * shift.sum(axis=-1))
+            gains = np.asarray(power.mean(axis=-1))
             gains[rest] = -np.inf
             if not turn:
                 chosen.append(int(gains.argmax()))
@@ -418,4 +496,4 @@ def _best_rows(value: Callable[[list[int]], Array], k: int) -> list[int]:
                 chosen[at] = int(gains.argmax())
         if chosen == before:
             break
-    return chosen
+    return np.array(chosen)

@@ -17,10 +17,9 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxcal.calibration.fit import Fit
-from jaxcal.calibration.losses import LOSSES
+from jaxcal.calibration.fit_problem import LOSSES
 from jaxcal.files import write_text
-from jaxcal.models.from_dict import from_dict
-from jaxcal.models.model import Model, as_model
+from jaxcal.models.model import Model, as_model, from_dict
 
 FORMAT = "jaxcal-calibration"
 VERSION = 3
@@ -60,11 +59,7 @@ def to_dict(fit: Fit) -> dict[str, Any]:
 
 
 def save(fit: Fit, path: str | os.PathLike[str]) -> None:
-    """Write a versioned JSON file atomically; see ``docs/calibration.md``.
-
-    Raises:
-        OSError: the folder is missing, not writable or full; the old file stays.
-    """
+    """Write a versioned JSON file atomically; after an OSError the old one stays."""
     write_text(path, json.dumps(to_dict(fit), indent=1, allow_nan=False) + "\n")
 
 

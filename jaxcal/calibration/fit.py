@@ -24,11 +24,10 @@ FAR = 0.25  # of the range of what was measured, beyond it
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """The identified map from commands u (n inputs) to outputs y (m of them).
+    """``y = f(u; theta)`` with the most probable p parameters; P with harmonics.
 
-    ``y = f(u; theta)`` with the most probable p parameters; P of them with an arm's
-    harmonics. ``identify`` fills it. Arrays are copied and frozen; letters are their
-    axes, with N measurements, and numbers their least value.
+    Arrays are copied and frozen; letters are their axes (n inputs, m outputs, N
+    measurements), and numbers their least value.
     """
 
     input_names: tuple[str, ...]
@@ -38,7 +37,7 @@ class Fit:
     # created, packages, data_sha256, notes, accuracy; prior "stated" where one was
     provenance: Mapping[str, Any]
     model: Model
-    loss: str  # of jaxcal.calibration.losses
+    loss: str  # of jaxcal.calibration.fit_problem
     estimate: Annotated[Array, "P"]
     joint_covariance: Annotated[Array | None, "PP"]  # None where the noise is unknown
     # Commands are counted from it in joint_covariance; None: from zero.
@@ -221,7 +220,10 @@ class Fit:
 
     def predict(self, commands: ArrayLike) -> Array:
         """Outputs (..., m) at commands (..., n); a warning tells of far ones."""
-        self._say_far(commands)
+        points = self.points("commands", commands, self.num_inputs)
+        rows = points.reshape(-1, self.num_inputs)
+        sides = [(self.input_names, rows, self._range)]
+        say_far("command", slice(None), sides)
         return self.outputs_at(commands)
 
     def outputs_at(self, commands: ArrayLike) -> Array:
@@ -231,12 +233,6 @@ class Fit:
             self.whole, points.reshape(-1, self.num_inputs), self.estimate
         )
         return outputs.reshape(*points.shape[:-1], self.num_outputs)
-
-    def _say_far(self, commands: ArrayLike) -> None:
-        points = self.points("commands", commands, self.num_inputs)
-        rows = points.reshape(-1, self.num_inputs)
-        sides = [(self.input_names, rows, self._range)]
-        say_far("command", slice(None), sides, stacklevel=4)
 
     @functools.cached_property
     def _range(self) -> Array:
@@ -382,14 +378,8 @@ def say_far(
     sides: Sequence[tuple[Sequence[str], Array, Array]],
     stacklevel: int = 3,
 ) -> None:
-    """Warn of points far outside of what was measured.
-
-    Args:
-        what: a point, in words.
-        used: (N,) measurements that count.
-        sides: names of columns, (P, k) the points, (N, k) what was measured.
-        stacklevel: as of ``warnings.warn``.
-    """
+    """Warn of points (``what`` they are) far outside of what was measured: of each side
+    names of columns, points (P, k), and (N, k), of which ``used`` (N,) count."""
     far, worst, count = set(), "", 0
     for names, values, measured in sides:
         low, high = measured[used].min(axis=0), measured[used].max(axis=0)

@@ -10,8 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.least_squares import FitProblem, FitSolution, singular, solve
-from jaxcal.calibration.losses import LOSSES, Loss, constants
+from jaxcal.calibration.fit_problem import (
+    LOSSES,
+    FitProblem,
+    Loss,
+    constants,
+    singular,
+)
+from jaxcal.calibration.least_squares import FitSolution, solve
 from jaxcal.calibration.noise_levels import are_shared, levels_differ, pooled
 from jaxcal.calibration.prior_scales import (
     PriorScales,
@@ -75,11 +81,12 @@ def fit_model(
     common_noise: bool | Sequence[Any] | None,
     excited: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """The fields of a ``Calibration`` but names and units; of its ``provenance`` what
-    ``Fit`` says. ``excited`` names commands that must vary in every direction."""
+    """The fields of a ``Calibration`` but names and units. ``excited`` names commands
+    that must vary in every direction."""
     one_of("loss", loss, tuple(LOSSES))
     require_kind("prior", prior, Prior)
-    weights, used = _distinct_weights(model, commands, measured, weights)
+    weights = _distinct_weights(model, commands, measured, weights)
+    used = slice(None) if weights.all() else weights > 0.0
     spread = command_noise(noise, commands, measured.shape[1])
     exact = not spread.any()
     model = model.prepared(commands[used], measured[used])
@@ -171,24 +178,19 @@ def _problem(
     return problem, centre
 
 
-def _used(weights: Array) -> slice | NDArray[np.bool_]:
-    """The rows of positive weight; all of them at once where none is left out."""
-    return slice(None) if weights.all() else weights > 0.0
-
-
 def _distinct_weights(
     model: Model, commands: Array, measured: Array, weights: Array
-) -> tuple[Array, slice | NDArray[np.bool_]]:
-    """(N,) the weights of the measurements that count, 0 elsewhere, and their rows."""
-    used = _used(weights)
-    if not isinstance(used, slice) and not used.any():
+) -> Array:
+    """(N,) the weights of the measurements that count, 0 elsewhere."""
+    used = slice(None) if weights.all() else weights > 0.0
+    if not weights.any():
         raise ValueError("weights must be positive for at least one measurement")
     once = model.distinct(commands[used], measured[used])
     if len(once) == len(weights):
-        return weights, used
+        return weights
     rows, distinct = np.flatnonzero(weights)[once], np.zeros_like(weights)
     distinct[rows] = weights[rows]
-    return distinct, _used(distinct)
+    return distinct
 
 
 def _solve_with_misfit(
@@ -242,8 +244,8 @@ def _centre(
 ) -> tuple[Array | None, Array | None]:
     """(n,) what commands are counted from, as a bias and slopes far from zero can
     hardly be told apart, and (p, p) what makes of parameters those from there. None
-    where that changes more than the parameters, or the commands say little, which is
-    refused with the names that are ``excited``."""
+    where that changes more than these, or commands say little (``excited``: refused).
+    """
     centre = weights @ commands / weights.sum()
     to_centred = model.centred(centre)
     if to_centred is None:
@@ -265,8 +267,8 @@ def _misfit(
     times: float,
 ) -> dict[str, Any]:
     """The fields with harmonics that were not fitted, but may be there, and bend what
-    was fitted. ``within`` is the covariance (P, P) of the parameters by the noise
-    alone, ``times`` the size of the default prior's harmonics."""
+    was fitted: ``times`` as large as by default; ``within`` (P, P) is the covariance by
+    the noise alone."""
     problem = solution.problem
     count = len(with_misfit.names) - len(problem.mean)
     std = times * np.asarray(with_misfit.default_prior().std)[-count:]

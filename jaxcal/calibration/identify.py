@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.fit_model import fit_model, require_fitting
@@ -31,7 +31,7 @@ from jaxcal.checks import (
     require_size,
     table,
 )
-from jaxcal.models.affine import Affine
+from jaxcal.models.linear import Affine
 from jaxcal.models.model import Model, recorded
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
@@ -47,7 +47,8 @@ from jaxcal.tables import (
     say_order,
 )
 
-_LITTLE_ENDIAN = np.dtype("<f8")
+# The model of most calibrations, whose names are then made once.
+_affine = functools.lru_cache(Affine)
 
 
 def identify(
@@ -77,9 +78,8 @@ def identify(
     is an error.
 
     Args:
-        commands: (N, n) commanded values in any unit; an array, or a frame or table,
-            whose columns are read as ``jaxcal.read_table`` decides; of an arm also a
-            ``Recording``, or the path of one: a bag, a LeRobot dataset.
+        commands: (N, n) in any unit; an array, or a frame or table, read as
+            ``jaxcal.read_table`` decides; of an arm also a ``Recording`` or its path.
         measured: (N, m) readings in any unit. Not needed for contacts, recordings with
             readings, and tables with columns y_....
         model: of ``jaxcal.models``, or any object with its methods; by default affine.
@@ -95,8 +95,7 @@ def identify(
             residuals contradict it (F test, 0.1 %), and one for all where
             ``command_std`` is given. Where fewer than 30 measurements have outputs that
             share parameters, as trajectories, one for all, one that varies smoothly
-            along the outputs, or one for each group or output, whichever the residuals
-            show; the summary says which.
+            along them, or one for each, as the residuals show and the summary says.
         loss: "gaussian" is least squares, the default of an affine model without prior;
             "student" (4 degrees of freedom, of a measurement as a whole), otherwise the
             default, gives outliers little weight.
@@ -104,10 +103,10 @@ def identify(
         output_names: m names, likewise y_x or y_1.
         command_unit, measured_unit: stored with the result.
         notes: anything JSON can hold, stored under ``provenance["notes"]``.
-        accuracy: of an arm, the mean held-out error that is enough and that the verdict
-            judges by: of each unit that is named, {"mm": 0.5, "deg": 0.1}; a number is
-            of the first, lengths where there are some. By default, whether the noise
-            explains the readings, or the nominal machine is far worse.
+        accuracy: of an arm, the mean held-out error that is enough for the verdict: of
+            each unit that is named, {"mm": 0.5, "deg": 0.1}; a number is of the first,
+            lengths where there are some. By default, whether the noise explains the
+            readings, or the nominal machine is far worse.
         sessions: (N,) a label of each row, its day or mounting. What differs between
             two or more is estimated by leaving out each, and counts in predictions.
 
@@ -125,21 +124,18 @@ def identify(
     )
     n, m = len(inputs), len(outputs)
     noise, plain_noise = _noise(noise, noise_std, common_noise, m)
-    about: dict[str, Any] = {
-        "command_unit": command_unit,
-        "measured_unit": measured_unit,
-    }
-    for name, unit in about.items():
+    units: dict[str, Any]
+    units = {"command_unit": command_unit, "measured_unit": measured_unit}
+    for name, unit in units.items():
         if not isinstance(unit, str):
             raise ValueError(f"{name} must be text, got {unit!r}")
     provenance = _provenance((u, y, weight), notes)
-    about |= {"input_names": inputs, "output_names": outputs, "provenance": provenance}
     model = require_fitting(_affine(n, m) if model is None else model, u, y)
     if accuracy is not None:
-        units = model.accuracy_units(measured_unit)
-        if not units:
+        judged = model.accuracy_units(measured_unit)
+        if not judged:
             raise ValueError("accuracy needs an arm (model=)")
-        provenance["accuracy"] = by_unit("accuracy", accuracy, units)
+        provenance["accuracy"] = by_unit("accuracy", accuracy, judged)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
     if loss is None and prior is None:
@@ -163,8 +159,9 @@ def identify(
         if mispaired is None:
             raise
         raise ValueError(f"{mispaired.reason}. Uncorrected: {error}") from None
-    provenance |= fields.pop("provenance")
-    calibration = Calibration(**fields, **about)
+    fields["provenance"] = provenance | fields["provenance"]
+    fields |= {"input_names": inputs, "output_names": outputs}
+    calibration = Calibration(**fields, **units)
     if prior is None and plain_noise:
         calibration = model.improved(calibration)
     if sessions is not None:
@@ -204,10 +201,10 @@ def _measurements(
     input_names, output_names = input_names or inputs, output_names or outputs
     inputs = axis_names("input_names", input_names, "u", u.shape[1])
     outputs = axis_names("output_names", output_names, "y", y.shape[1])
-    weight = np.ones(len(u))
-    if weights is not None:
-        weight = array_of("weights", weights, len(u))
-        require_none(weight < 0.0, weight, "weights must not be negative")
+    weight = array_of(
+        "weights", np.ones(len(u)) if weights is None else weights, len(u)
+    )
+    require_none(weight < 0.0, weight, "weights must not be negative")
     return u, y, weight, inputs, outputs
 
 
@@ -224,24 +221,6 @@ def _columns(model: Any, commands: Any, measured: Any) -> tuple[Any, Any]:
     if inputs := getattr(model, "inputs", ()):
         return names_in("commands", commands, inputs, COMMANDS, beside), outputs
     return inputs_of("commands", commands, beside), outputs
-
-
-def _with_sessions(calibration: Calibration, labels: ArrayLike) -> Calibration:
-    """The calibration with what differs between its sessions."""
-    names, which = np.unique(np.asarray(labels), return_inverse=True)
-    if np.shape(labels) != (len(calibration.commands),) or len(names) < 2:
-        raise ValueError(
-            f"sessions must be two or more labels, of {len(calibration.commands)} rows,"
-            f" got shape {np.shape(labels)} and {len(names)} labels"
-        )
-    std = _between_sessions(calibration, which).tolist()
-    about = {"count": len(names), "std": std}
-    provenance = {**calibration.provenance, "sessions": about}
-    return dataclasses.replace(calibration, provenance=provenance)
-
-
-# The model of most calibrations, whose names are then made once.
-_affine = functools.lru_cache(Affine)
 
 
 def _noise(
@@ -285,7 +264,7 @@ def _provenance(
     except (TypeError, ValueError) as error:
         raise ValueError(f"notes must be valid JSON: {error}") from None
     content = b"".join(
-        str(array.shape).encode() + array.astype(_LITTLE_ENDIAN, copy=False).tobytes()
+        str(array.shape).encode() + array.astype("<f8", copy=False).tobytes()
         for array in data
     )
     return {
@@ -300,17 +279,22 @@ def _provenance(
     }
 
 
-def _between_sessions(fit: Calibration, labels: NDArray[np.intp]) -> Array:
-    """(m,) standard deviation of readings of another session, beyond what is expected.
-    Each session of ``labels`` (N,) is predicted from a fit of the others; a ValueError
-    where none of these determines the model."""
+def _with_sessions(fit: Calibration, labels: ArrayLike) -> Calibration:
+    """The calibration with (m,) standard deviations of readings of another session, of
+    ``labels`` (N,), beyond what is expected when the others predict it."""
+    names, which = np.unique(np.asarray(labels), return_inverse=True)
+    if np.shape(labels) != (len(fit.commands),) or len(names) < 2:
+        raise ValueError(
+            f"sessions must be two or more labels, of {len(fit.commands)} rows,"
+            f" got shape {np.shape(labels)} and {len(names)} labels"
+        )
     square, expected = [], []
-    for label in np.unique(labels):
+    for label in range(len(names)):
         try:
-            trial = fit.again(fit.model, fit.stated_prior, labels != label)
+            trial = fit.again(fit.model, fit.stated_prior, which != label)
         except ValueError:
             continue
-        rows = (labels == label) & (fit.loss_weights > 0.0)
+        rows = (which == label) & (fit.loss_weights > 0.0)
         if trial.noise_std is not None and rows.any():
             commands = fit.commands[rows]
             off = fit.model.wrapped(
@@ -321,4 +305,6 @@ def _between_sessions(fit: Calibration, labels: NDArray[np.intp]) -> Array:
     if not square:
         raise ValueError("sessions: each fit without one session must be possible")
     excess = np.vstack(square).mean(axis=0) - np.vstack(expected).mean(axis=0)
-    return np.sqrt(excess.clip(0.0))
+    about = {"count": len(names), "std": np.sqrt(excess.clip(0.0)).tolist()}
+    provenance = {**fit.provenance, "sessions": about}
+    return dataclasses.replace(fit, provenance=provenance)

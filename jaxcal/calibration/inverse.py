@@ -32,7 +32,7 @@ def command_for(
     start: ArrayLike | None = None,
     clip: bool = False,
 ) -> Array:
-    """Commands that reach desired outputs.
+    """Commands (..., n), in their unit, that reach desired outputs.
 
     A square affine map is inverted; else Newton's method runs from several starts. With
     limits it finds the nearest output.
@@ -44,14 +44,11 @@ def command_for(
             pose: position and turn from the nominal orientation at ``start`` (then
             required), as ``model.rotation_vectors(start, R)``.
         limits: (n, 2) least and greatest command of each input, if any.
-        start: (n,) or (..., n) where the search begins; the measured command whose
-            output is nearest when not given.
-        clip: if no command within the limits is exact, return the command with the
-            nearest output instead of an error. Distance is in the measured unit for a
-            square affine map, else in each output's spread over the measurements.
-
-    Returns:
-        (..., n) in the command unit.
+        start: (n,) or (..., n) where the search begins; by default the measured command
+            with the nearest output.
+        clip: if no command within the limits is exact, return that with the nearest
+            output instead of an error. Distance is in the measured unit for a square
+            affine map, else in each output's spread over the measurements.
 
     Raises:
         ValueError: a desired output is out of reach, or needs a command beyond its
@@ -319,21 +316,6 @@ class _Search(Responses):
         tolerance = _REACHED + 1e-14 * np.abs(self.wanted / self.size).max(axis=1)
         return np.asarray(np.abs(gap).max(axis=1) <= tolerance)
 
-    def _nearest_within(self, wanted: Array, low: Array, high: Array) -> Array:
-        """(n,) within the bounds, whose output of an affine map is nearest."""
-        from scipy import optimize
-
-        scaled, bias = self.fit.matrix * self.spread, self.fit.bias
-        unit = np.abs(scaled).max()
-        solution = optimize.lsq_linear(
-            scaled / unit,
-            (wanted - bias) / unit,
-            (low / self.spread, high / self.spread),
-            method="bvls",
-            tol=1e-14,
-        )
-        return np.clip(solution.x * self.spread, low, high)
-
     def bounded(
         self, i: int, free: Array, reached: bool, bounds: Array, clip: bool
     ) -> Array:
@@ -346,7 +328,11 @@ class _Search(Responses):
         nearest, least = np.clip(free, low, high), np.inf
         target = f"target {i + 1} {in_words(desired)}"
         if self.affine:
-            nearest = self._nearest_within(desired, low, high)
+            scaled, span = self.fit.matrix * self.spread, (low, high) / self.spread
+            unit = np.abs(scaled).max()
+            aim = (desired - self.fit.bias) / unit
+            nearest = optimize.lsq_linear(scaled / unit, aim, span, "bvls", 1e-14).x
+            nearest = np.clip(nearest * self.spread, low, high)
         for begin in () if self.affine else (free, *self.nearest[i]):
             solution = optimize.least_squares(
                 lambda command: -self.gap(command[None], at)[0],

@@ -1,13 +1,12 @@
 """The fit of any model: Levenberg-Marquardt for the most probable parameters.
 
-Rows of residuals, whitened: readings, prior (a row for each parameter) and uncertain
-commands, unknowns of their own measurement that an orthogonal projection eliminates.
-A linear model is searched along orthogonal directions, so one step is enough whatever
-its units. A loss is iteratively reweighted least squares. A level of noise that was not
-given is estimated from the residuals and the degrees of freedom that they have.
+Rows of residuals, whitened: readings, prior and uncertain commands, unknowns of their
+own measurement that are eliminated. A linear model is searched along orthogonal
+directions, so one step is enough whatever its units. A loss is reweighted; a level of
+noise follows from the residuals and their degrees of freedom.
 
-Sources: Marquardt, 1963, with the damping of Nielsen, 1999; Lange, Little and Taylor,
-1989 (losses); Foerstner, 1979, and MacKay, 1992 (levels of noise and prior).
+Sources: Marquardt, 1963, with the damping of Nielsen, 1999; Foerstner, 1979, and
+MacKay, 1992 (levels of noise and prior).
 """
 
 from __future__ import annotations
@@ -18,22 +17,23 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.losses import Loss, constants
+from jaxcal.calibration.fit_problem import (
+    FitProblem,
+    constants,
+    degrees_of_freedom,
+    deleted_residuals,
+    directions,
+    eliminated,
+    factor,
+    unseen_part,
+    weighted,
+)
 from jaxcal.checks import Array, in_words
-from jaxcal.information.blocks import gram, triangle
-from jaxcal.information.singular import significant
-from jaxcal.models.model import Model
 from jaxcal.models.predictions import derivative, predict, without_effect
 
 _LIMIT = 300  # iterations
 _PATIENCE = 20  # iterations whose gain together decides whether the search creeps
-_MANY = 64  # readings of a measurement from which matrices of them are not made
-_CHOLESKY = 1e-6  # least pivot, of the largest, at which it is as exact as reflections
-_ONCE = 1e-3  # likewise, at which a single one is exact to 1e-8 or so
-_CLEAR = 1e8  # most by which directions differ that are determined without a doubt
 _LITTLE = 1e-6  # of a gain: a step of .001 standard deviations changes no derivative
-_LARGER = 0.05  # of its logarithm: no machine is larger than described by more
-_TOUCHED = 4.0  # times the usual noise: most that is read of what is touched
 _AHEAD = 0.1  # of a step, where its curvature is looked for
 _BENT = 0.75  # curvature of a step, of its length, at most
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
@@ -44,61 +44,13 @@ _SHARED = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class FitProblem:
-    """N measurements of q outputs, P parameters of which F are free."""
-
-    model: Model
-    commands: Array  # (N, n)
-    measured: Array  # (N, q)
-    white: Array  # (N, q, q) whitening of the readings, at level 1; (N, q) a diagonal
-    reading_std: Array  # (N, q) of a reading of weight 1, at level 1
-    mean: Array  # (P,) of the prior
-    precision: Array  # (P,) of the prior, 0 where nothing is known
-    free: NDArray[np.bool_]  # (P,) False: held at the mean
-    command_std: Array  # (N, n) 0 exact, inf unknown in every measurement
-    noise_known: bool  # the level is 1; else it is estimated
-    levels: NDArray[np.intp]  # (q,) from 0: outputs of the same number share one
-    loss: Loss | None  # None: least squares
-    first_log_size: Array | None  # (N,) of the model, at the prior's mean
-
-    def growth(self, theta: Array) -> Array | None:
-        """(N, 1) by which contacts' readings are larger than at the prior's mean, up to
-        ``_LARGER``, or a tool would grow without end; None: by nothing."""
-        log = self.model.log_size(self.commands, theta)
-        if log is None or self.first_log_size is None:
-            return None
-        larger = np.minimum(log - self.first_log_size, _LARGER)
-        return np.exp(self._zeros * larger[:, None])
-
-    def growth_slopes(self, theta: Array) -> Array:
-        """(N, F) derivative of the logarithm of ``growth``."""
-        slopes = self.model.log_size_jacobian(self.commands, theta)
-        log = self.model.log_size(self.commands, theta)
-        if log is not None and self.first_log_size is not None:
-            slopes = slopes * (log - self.first_log_size < _LARGER)[:, None]
-        return self._zeros * (slopes if self.free.all() else slopes[:, self.free])
-
-    @functools.cached_property
-    def _zeros(self) -> Array:
-        """(N, 1) 1 where no more was measured than contacts miss by, else 0."""
-        noise = self.model.default_noise()
-        most = 0.0 if noise is None else _TOUCHED * np.asarray(noise.std)
-        near = np.all(np.abs(self.measured) <= most, axis=1, keepdims=True)
-        return np.asarray(near, dtype=np.float64)
-
-
 def solve(
     problem: FitProblem, start: FitSolution | None = None, *, rough: bool = False
 ) -> FitSolution:
     """The most probable parameters, from the prior's mean or from ``start``, a solution
-    of a problem that differs by prior, whitening, levels or loss alone.
-
-    ``rough`` is to .1 standard deviations, the weights of the loss to .03.
-
-    Raises:
-        ValueError: the model fails at the start, a derivative is not finite, or the
-            search does not converge.
+    of a problem that differs by prior, whitening, levels or loss alone; ``rough`` is to
+    .1 standard deviations, the weights of the loss to .03. A ValueError where the model
+    fails at the start, a derivative is not finite, or the search does not converge.
     """
     if problem.loss is not None and start is None:
         start = solve(dataclasses.replace(problem, loss=None), rough=True)
@@ -112,9 +64,8 @@ def solve(
         done = search.step()
         # Along a curved valley that the measurements hardly close, the search creeps.
         # A gain of 0.1 moves it by a third of a standard deviation, so more is asked.
-        creeps = len(evidence) > _PATIENCE and search.damping < 1e-3
-        creeps = creeps and not search.whole
-        if creeps:
+        creeps = len(evidence) > _PATIENCE and not search.whole
+        if creeps := creeps and search.damping < 1e-3:
             gain = evidence[-_PATIENCE] - search.evidence
             asked = max(1e-3, 0.1 * (len(evidence) // 60))
             creeps = gain < max(asked, 1e-3 * search.cost)
@@ -126,38 +77,6 @@ def solve(
         "Prior(mean=...), narrow the prior, or fix parameters that the measurements "
         "do not determine"
     )
-
-
-def _weighted(matrices: Array, rows: Array) -> Array:
-    """(N, q, F) rows times matrices (N, q, q), or their diagonals (N, q)."""
-    return matrices[..., None] * rows if matrices.ndim == 2 else matrices @ rows
-
-
-def apart(rows: Array) -> list[NDArray[np.intp]]:
-    """Columns of rows (R, F) in groups that no row joins, as of independent outputs,
-    so that a rounding of one is none of another."""
-    filled = (rows != 0.0).astype(np.float64)
-    joined = filled.T @ filled > 0.0
-    np.fill_diagonal(joined, True)
-    if joined.all():
-        return [np.arange(rows.shape[1])]
-    while (more := joined.astype(np.float64) @ joined > 0.0).sum() > joined.sum():
-        joined = more
-    first = joined.argmax(axis=1)  # column of the group of each
-    return [np.flatnonzero(first == column) for column in dict.fromkeys(first)]
-
-
-def singular(rows: Array) -> list[tuple[NDArray[np.intp], Array, Array]]:
-    """For each group of ``apart`` columns (c,) of F or more rows (R, F): these,
-    singular values, right vectors (c, c)."""
-    groups = apart(rows)
-    sizes = {len(columns) for columns in groups}
-    if len(sizes) == 1 and len(rows) <= 128:  # all at once
-        of_groups = rows.T[np.array(groups)].transpose(0, 2, 1)
-        _, size, right = np.linalg.svd(of_groups, full_matrices=False)
-        return list(zip(groups, size, right, strict=True))
-    factors = [np.linalg.svd(triangle(rows[:, columns])) for columns in groups]
-    return [(groups[i], size, right) for i, (_, size, right) in enumerate(factors)]
 
 
 class FitSolution:
@@ -177,6 +96,8 @@ class FitSolution:
     freedom: Array  # (q,) residual degrees of freedom of each output
     widest: Array | None = None  # (F,) largest columns of the system yet, at level 1
     last_move: float = np.inf  # squared, of the step before in noise
+    basis: Array | None = None  # (F, r) directions of a linear model
+    solved: Array | None = None  # (R, r) roots of the hat matrix, if at hand
     stale: bool = False  # the parameters have moved a little since the derivatives
     root: Array | None = None  # (F, F) of the covariance, where it is at hand
     _grown: tuple[Array, Array | None] | None = None  # of the last parameters
@@ -188,8 +109,6 @@ class FitSolution:
         # 1e-6 standard deviations; 1e-5 where convergence is linear.
         self.least = 1e-2 if rough else 1e-10 if problem.loss else 1e-12
         self.change = (3e-2, 3e-2) if rough else (1e-5, 1e-4)  # of weights and levels
-        # (R, r) roots of the hat matrix, hardly damped, where a step had them.
-        self.solved: Array | None = None
         q = problem.measured.shape[1]
         self.uncertain = np.asarray((problem.command_std > 0.0).any(axis=0))
         self.num_uncertain = k = int(self.uncertain.sum())
@@ -203,7 +122,6 @@ class FitSolution:
         # Least squares are searched to the last digit, along curves.
         exact = not (problem.loss or self.num_uncertain)
         self.whole = exact and not (rough or problem.model.linear)
-        self.basis: Array | None = None  # (F, r) directions of a linear model
         self.freedom = np.zeros(q)
         self._share(problem.levels)
         # The last step of the logarithms of the levels, and how much of one is taken.
@@ -211,17 +129,15 @@ class FitSolution:
         self.all_free = bool(problem.free.all())
         self.informed = bool(np.logical_and(problem.free, problem.precision).any())
         linear = problem.model.linear and not self.num_uncertain
-        # From zero a linear model without a prior is as exact as its step.
+        # As exact as its step is a linear model from zero, without a prior.
         from_zero = linear and start is None and not self.informed
         if start is None:
-            self.parameters, self.commands = problem.mean, problem.commands
-            if from_zero:
-                self.parameters = np.where(problem.free, 0.0, problem.mean)
-            if from_zero and self.all_free:
-                self._take(problem.measured)
-            else:
-                self._predict()
+            zero = problem.free & from_zero
+            self.parameters = np.where(zero, 0.0, problem.mean)
+            self.commands = problem.commands
+            self._predict()
             self.weights = np.ones(len(problem.measured))
+            self.sizes = problem.model.parameter_sizes()
             self.level = self._first_level()
             self.facts, self.fact_rows = problem.model.facts(self.parameters)
             self._linearise()
@@ -230,30 +146,23 @@ class FitSolution:
                 if name in vars(start):
                     setattr(self, name, getattr(start, name))
             if start.problem.white is not problem.white:
-                self._take(start.residuals)
+                self.white = self.whitened(self.residuals[..., None])[..., 0]
                 self.level = self._first_level()
                 self._linearise()
         if linear:
-            self.basis, self.damping = self._directions(), _LEAST_DAMPING
+            self.system = rows, _, scale = self._system(0.0)
+            self.basis, self.solved = directions(rows, scale)
+            self.damping = _LEAST_DAMPING
             if from_zero and self.basis.shape[1] < len(self.basis):
-                self._keep_undetermined()
-
-    @functools.cached_property
-    def sizes(self) -> Array:
-        """(P,) of the parameters."""
-        return self.problem.model.parameter_sizes()
+                mean = problem.mean[problem.free]  # kept where nothing determines it
+                self.parameters = self.parameters.copy()
+                self.parameters[problem.free] = unseen_part(mean, self.basis)
+                self._predict()
 
     def _share(self, levels: NDArray[np.intp]) -> None:
-        """Let outputs of the same number in ``levels`` (q,) share one level. The least
-        level of contacts, whose readings are zero, is in usual noise."""
+        """Let outputs of the same number in ``levels`` (q,) share one level."""
         self.shared, self.same = levels, 1.0 * (levels[:, None] == levels)
-        self.floor = np.zeros(len(levels))
-        if not self.problem.noise_known:
-            readings = _weighted(self.problem.white, self.problem.measured[..., None])
-            largest = np.abs(readings).max(axis=(0, 2))
-            if not largest.all():
-                largest[largest == 0.0] = largest.max() or 1e7
-            self.floor = (self.same * (1e-13 * largest)).max(axis=1)
+        self.floor = (self.same * self.problem.least_levels).max(axis=1)
 
     def _first_level(self) -> Array:
         """(q,) root mean square of the residuals, of the outputs that share a level."""
@@ -271,13 +180,9 @@ class FitSolution:
         theta[self.problem.free] += step
         return theta
 
-    def _take(self, residuals: Array) -> None:
-        self.residuals = residuals
-        self.white = self.whitened(residuals[..., None])[..., 0]
-
     def whitened(self, rows: Array, theta: Array | None = None) -> Array:
         """(N, q, F) rows in noise of level 1, those of zeros by the machine's size."""
-        white = _weighted(self.problem.white, rows)
+        white = weighted(self.problem.white, rows)
         theta = self.parameters if theta is None else theta
         if self._grown is None or self._grown[0] is not theta:
             self._grown = theta, self.problem.growth(theta)
@@ -286,7 +191,8 @@ class FitSolution:
 
     def _predict(self) -> None:
         """Residuals at the present parameters and commands."""
-        self._take(self._off(self.commands, self.parameters))
+        self.residuals = self._off(self.commands, self.parameters)
+        self.white = self.whitened(self.residuals[..., None])[..., 0]
 
     def _off(self, commands: Array, theta: Array, finite: bool = True) -> Array:
         """(N, q) measured less predicted."""
@@ -315,26 +221,6 @@ class FitSolution:
             rows = rows[..., self.uncertain] * self.moves[:, None]
             self.by_command = self.whitened(rows)
 
-    def _directions(self) -> Array:
-        """(F, r) changes of the parameters, those that nothing determines left out.
-        Orthogonal in what they change, the readings in noise and the prior."""
-        rows, _, scale = self.system = self._system(0.0)
-        inverse, across = _cholesky(rows, 0.0)
-        # The least singular value is above one over the length of the inverse.
-        if inverse is not None and np.vdot(inverse, inverse) * len(scale) < _CLEAR**2:
-            self.solved = across
-            return inverse / scale[:, None]
-        if len(rows) < len(scale):
-            rows = np.concatenate([rows, np.zeros((len(scale), len(scale)))])
-        directions = []
-        for columns, size, right in singular(rows):
-            determined = np.flatnonzero(significant(size))
-            block = np.zeros((rows.shape[1], len(determined)))
-            turned = right[determined] / size[determined, None] / scale[columns]
-            block[columns] = turned.T
-            directions.append(block)
-        return np.hstack(directions)
-
     def direct(self) -> bool:
         """Take the one step that is the answer; True where that is so. Of least squares
         of a linear model without a prior, where the levels of noise, if there are
@@ -352,7 +238,7 @@ class FitSolution:
         rows, right, scale = self.system
         if self.solved is None:
             rows, right, scale = self._system(0.0)
-            inverse, self.solved = _factor(rows, self.damping)
+            inverse, self.solved = factor(rows, self.damping)
             basis = basis / scale @ inverse
         cost, target = float(right @ right), self.solved.T @ right
         self.parameters = self._changed(basis @ target)
@@ -371,16 +257,6 @@ class FitSolution:
             if output is not None:
                 self.root = (self.level / level)[output, None] * basis
         return True
-
-    def _keep_undetermined(self) -> None:
-        """Move to the prior's mean in directions that nothing determines."""
-        problem, basis = self.problem, np.asarray(self.basis)
-        mean, size = problem.mean[problem.free], np.linalg.norm(basis, axis=1)
-        size = np.where(size > 0.0, size, 1.0)
-        shown = np.linalg.lstsq(basis / size[:, None], mean / size, rcond=None)[0]
-        self.parameters = self.parameters.copy()
-        self.parameters[problem.free] = mean - basis @ shown
-        self._predict()
 
     def _distance(self, white: Array, commands: Array) -> Array:
         """(N,) squared distance of each measurement from the fit, in noise."""
@@ -408,22 +284,15 @@ class FitSolution:
         """Rows (N, R, F) and residuals (N, R), the commands eliminated."""
         rows = self.by_theta / self.level[:, None]
         right = self.white / self.level
-        k = self.num_uncertain
-        if not k:
+        if not self.num_uncertain:
             return rows, right
         by_command = self.by_command / self.level[:, None]
-        command_rows = self.command_root[..., None] * np.eye(k)
-        by_command = np.concatenate([by_command, command_rows], axis=1)
-        length = np.sqrt((by_command**2).sum(axis=1))[:, :, None] * np.eye(k)
-        by_command = np.concatenate([by_command, np.sqrt(damping) * length], axis=1)
         moved = (self.problem.commands - self.commands)[:, self.uncertain]
-        right = np.concatenate([right, moved * self.command_root, 0.0 * moved], axis=1)
-        turn, triangle = np.linalg.qr(by_command, mode="complete")
-        turn = np.matrix_transpose(turn)
-        rows = turn[..., : rows.shape[1]] @ rows
-        right = (turn @ right[..., None])[..., 0]
-        self._back = triangle[:, :k], rows[:, :k], right[:, :k]
-        return rows[:, k:], right[:, k:]
+        moved *= self.command_root
+        rows, right, self._back = eliminated(
+            rows, right, by_command, self.command_root, moved, damping
+        )
+        return rows, right
 
     def _moved(self, step: Array) -> Array:
         """(N, n) the commands after the parameters move by ``step`` (F,)."""
@@ -463,14 +332,17 @@ class FitSolution:
             if self.whole:
                 rows, scale = self._widened(rows, scale)
             # Of a model that is not linear the next step makes up for rounding.
-            inverse, across = _factor(rows, self.damping, self.basis is None)
+            inverse, across = factor(rows, self.damping, self.basis is None)
             self.solved = across if self.damping < 1e-9 else None
             step = inverse @ (across.T @ right)
-            rest = rows @ step - right
+            moved = rows @ step
+            rest = moved - right
             gain = float(right @ right - rest @ rest)
             last = gain <= self.least + 1e-13 * cost
-            if last and not self._still_falls(rows @ step):
-                return True
+            if last:  # a gain that is rounding, unless steps become shorter
+                before, self.last_move = self.last_move, float(moved @ moved)
+                if not (self.whole and 1e-16 < self.last_move < 0.5 * before):
+                    return True
             bent = 0.0
             if self.whole and self.damping > 1e-12:
                 curve = inverse @ (across.T @ self._curve(step / scale, len(right)))
@@ -502,7 +374,7 @@ class FitSolution:
                 if problem.loss is None or gain > _LITTLE:
                     self._linearise()
                 return False
-            if gain <= self._blur():
+            if gain <= problem.blur(self.white, self.level, self.weights):
                 return True
             if self.damping > 1e9:  # rounding is all that is left, or
                 slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
@@ -519,16 +391,6 @@ class FitSolution:
             self.damping *= self.grow
             self.grow *= 2.0
 
-    def _blur(self) -> float:
-        """By how much the noise of the model itself may change the cost."""
-        noise = self.problem.model.rounding
-        if noise is None or self.problem.white.ndim > 2:
-            return 0.0
-        off = self.problem.white * noise / self.level
-        share = np.sqrt(self.weights)[:, None]
-        beside = np.linalg.norm(share**2 * off * self.white / self.level)
-        return float(4.0 * beside + 2.0 * np.linalg.norm(share * off) ** 2)
-
     def _widened(self, rows: Array, scale: Array) -> tuple[Array, Array]:
         """Rows and scale (F,) by the largest scale so far (Moré, 1978), so that no
         parameter that loses its effect takes ever longer steps."""
@@ -538,11 +400,6 @@ class FitSolution:
         )
         wide = self.widest / size
         return rows * (scale / wide), wide
-
-    def _still_falls(self, moved: Array) -> bool:
-        """Whether steps whose gain is rounding, by (R,) in noise, become shorter."""
-        before, self.last_move = self.last_move, float(moved @ moved)
-        return self.whole and 1e-16 < self.last_move < 0.5 * before
 
     def _curve(self, step: Array, size: int) -> Array:
         """(size,) half the residuals' second derivative along a step (F,). Geodesic
@@ -579,13 +436,12 @@ class FitSolution:
         self.freedom = freedom = self._freedom(self._leverage(self.solved))
         if freedom.sum() < 1.0:
             return self.level
-        square = self.weights @ self.white**2
         shared = self.same @ freedom
         if (shared < 0.5).any():
             # What is met exactly has no level of its own, from then on.
             self._share(0 * self.shared)
             shared = self.same @ freedom
-        square = self.same @ square
+        square = self.same @ (self.weights @ self.white**2)
         if self.problem.loss is not None:
             square = square / constants(self.problem.loss, self.num_readings)[0]
         return np.maximum(np.sqrt(square / shared), self.floor)
@@ -609,24 +465,18 @@ class FitSolution:
     def _leverage(self, root: Array | None = None) -> Array:
         """(N, R, F) roots of the hat matrix, of the readings, at any level."""
         if root is None:
-            root = _factor(self._system(0.0)[0], _LEAST_DAMPING)[1]
+            root = factor(self._system(0.0)[0], _LEAST_DAMPING)[1]
         count, width = len(self.weights), root.shape[1]
         readings = self.residuals.shape[1] + self.num_uncertain
         return root[: count * readings].reshape(count, readings, width)
 
     def _freedom(self, readings: Array) -> Array:
         """(q,) residual degrees of freedom of each output."""
+        if not self.num_uncertain:
+            return degrees_of_freedom(readings, self.residuals, self.by_theta)
         count, q = self.residuals.shape
-        used = np.vecdot(readings, readings).sum(axis=0)
-        if self.num_uncertain:
-            return np.full(q, (count * self.num_readings - used.sum()) / q)
-        freedom = count - used
-        if (met := self.residuals == 0.0).any():
-            # A reading that nothing moves and that is met is none, as where the sensors
-            # of one arm have different numbers of readings.
-            freedom -= (met & (self.by_theta == 0.0).all(axis=-1)).sum(axis=0)
-        whole = np.rint(freedom)
-        return np.where(np.abs(freedom - whole) < 1e-9, whole, freedom)
+        used = np.vecdot(readings, readings).sum(axis=0).sum()
+        return np.full(q, (count * self.num_readings - used) / q)
 
     @functools.cached_property
     def rows(self) -> Array:
@@ -638,65 +488,12 @@ class FitSolution:
         the roots of the hat matrix there, if they are known."""
         if self.stale:
             self._linearise()
-        readings, uncertain = self._leverage(solved), self.num_uncertain
+        readings = self._leverage(solved)
+        uncertain = self.num_uncertain
         right = self._reduce(0.0)[1] if uncertain else self.white / self.level
         if solved is None or self.problem.noise_known:
             self.freedom = self._freedom(readings)
-        self.distance = (right**2).sum(axis=1)
-        if uncertain:
-            self.distance = self._distance(self.white, self.commands)
-        deleted = _deleted(readings, right)
+        self.distance = self._distance(self.white, self.commands)
+        deleted = deleted_residuals(readings, right)
         self.deleted = np.maximum((right * deleted).sum(axis=1), 0.0)
         return self
-
-
-def _deleted(readings: Array, right: Array) -> Array:
-    """(N, R) residuals of each measurement from the fit without it, by roots of the hat
-    matrix (N, R, F) and residuals ``right`` (N, R)."""
-    count, columns = readings.shape[1:]
-    back = readings.transpose(0, 2, 1)
-    if count <= max(_MANY, columns):
-        gap = (1.0 + 1e-9) * np.eye(count) - readings @ back
-        return np.asarray(np.linalg.solve(gap, right[..., None])[..., 0])
-    one = 1.0 + 1e-9  # by the F columns, of a trajectory of many readings
-    inner = one * np.eye(columns) - back @ readings
-    along = np.linalg.solve(inner, back @ right[..., None])
-    return np.asarray((right + (readings @ along)[..., 0]) / one)
-
-
-def _factor(rows: Array, damping: float, once: bool = False) -> tuple[Array, Array]:
-    """The inverse of R (F, F), and Q (R, F), of the damped rows (R, F); ``once``: 1e-8
-    or so is enough."""
-    inverse, across = _cholesky(rows, damping, once)
-    if inverse is not None:
-        return inverse, across
-    damp = np.sqrt(damping) * np.eye(rows.shape[1])
-    whole, triangle = np.linalg.qr(np.concatenate([rows, damp]))
-    return np.linalg.inv(triangle), whole[: len(rows)]
-
-
-def _cholesky(
-    rows: Array, damping: float, once: bool = False
-) -> tuple[Array | None, Array]:
-    """The inverse of R, and Q of the damped rows (R, F); None where it is not exact.
-    Cholesky twice (Yamamoto et al., 2015) is as exact as Householder's reflections
-    where it succeeds, and does not wait for BLAS's threads in every column."""
-    from scipy.linalg.lapack import dpotrf, dtrtri
-
-    turned, inverse = rows, None
-    for _ in range(2):
-        square = gram(turned)
-        if damping and inverse is None:
-            square += damping * np.eye(len(square))
-        elif damping and inverse is not None:
-            square += damping * (inverse.T @ inverse)
-        root, failed = dpotrf(square)
-        size = root.diagonal().tolist()
-        if failed or (size and min(size) < _CHOLESKY * max(size)):
-            return None, rows
-        step = dtrtri(root)[0]
-        inverse = step if inverse is None else inverse @ step
-        turned = rows @ inverse
-        if once and min(size) > _ONCE * max(size):
-            break
-    return inverse, turned

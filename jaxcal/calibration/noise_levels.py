@@ -2,44 +2,38 @@
 
 A level for each of many readings, as of a trajectory, cannot be told from few
 measurements: their weights would be noise themselves. So one level, one that varies
-smoothly along the readings, one for each of a few groups and one for each reading are
-compared by Schwarz's criterion, on the squares that are left and their degrees of
-freedom; more than one level is taken where the evidence is strong (Kass and Raftery,
-1995). Parameters that move one reading alone are not touched by any of that.
+smoothly along the readings and one for each reading are compared by Schwarz's
+criterion; more than one is taken where the evidence is strong (Kass and Raftery, 1995).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.least_squares import FitProblem, FitSolution, solve
-from jaxcal.calibration.losses import constants
+from jaxcal.calibration.fit_problem import FitProblem, constants
+from jaxcal.calibration.least_squares import FitSolution, solve
 from jaxcal.checks import Array
 from jaxcal.models.predictions import derivative
-
-Rows = NDArray[np.intp]
 
 _FEW = 30  # measurements from which on a level of its own costs a reading nothing
 _STRONG = 6.0  # of Schwarz's criterion, for more than one level
 _DEGREES = 8  # at most, of a level that varies smoothly
-_TURNS = (2, 3, 4, 5, 6)  # readings taken in turn
 _ROUNDS = 4
 _SAME = 0.02  # of the logarithm of a profile, which would not change in another round
-_LEAST = 10.0  # degrees of freedom of a run of readings
 _ONE = "one level for all {} readings of a measurement"
 _OWN = "one level for each of the {} readings"
 
 
 class _Levels(NamedTuple):
-    """Levels (q,) up to a common factor, or the groups (q,) that share one."""
+    """Which readings share a level, and how it varies over them."""
 
     says: str
-    groups: Rows
-    profile: Array | None
+    groups: NDArray[np.intp]  # (q,)
+    profile: Array | None  # (q,) up to a common factor; None: the same in a group
     numbers: int  # that describe them
 
 
@@ -79,13 +73,11 @@ def pooled(problem: FitProblem) -> tuple[FitSolution, str]:
 
 
 def levels_differ(solution: FitSolution) -> bool:
-    """Whether levels that are shared contradict the residuals (F test, 0.1 %). Those
-    without what is known besides: a wrong distance of two sockets is no noise along
-    it."""
+    """Whether levels that are shared contradict the residuals (F test, 0.1 %), without
+    what facts explain: a wrong distance of two sockets is no noise along it."""
     q, problem = len(solution.freedom), solution.problem
-    if problem.noise_known or q == 1 or problem.command_std.any():
-        return False
-    if solution.freedom.min() < 1.0:
+    stated = problem.noise_known or problem.command_std.any()
+    if stated or q == 1 or solution.freedom.min() < 1.0:
         return False
     from scipy import special
 
@@ -156,47 +148,11 @@ def _best(square: Array, freedom: Array) -> _Levels:
 
     one = _Levels(_ONE.format(q), none, None, 1)
     others = [_Levels(_OWN.format(q), np.arange(q), None, q)]
-    for turn in _TURNS:
-        if q % turn == 0 and q > turn:
-            says = f"one level for each of {turn} readings in turn"
-            others.append(_Levels(says, np.arange(q) % turn, None, turn))
-    if q >= 4:
-        others.append(_blocks(square, freedom, seen))
     if q >= 2 * _DEGREES:
         shapes = (_smooth(square, freedom, seen, k + 1) for k in range(_DEGREES))
         others += [shape for shape in shapes if shape is not None]
     best = min(others, key=evidence)
     return best if evidence(best) + _STRONG < evidence(one) else one
-
-
-def _blocks(square: Array, freedom: Array, seen: NDArray[np.bool_]) -> _Levels:
-    """Readings one after another that share a level, halved while that gains."""
-    q, price = len(square), 2.0 * np.log(freedom.sum())
-    squares = np.append(0.0, np.where(seen, square, 0.0).cumsum())
-    freedoms = np.append(0.0, np.where(seen, freedom, 0.0).cumsum())
-
-    def fit(first: Any, last: Any) -> Array:
-        total = np.maximum(freedoms[last] - freedoms[first], 1e-300)
-        mean = np.maximum((squares[last] - squares[first]) / total, 1e-300)
-        return np.asarray(total * np.log(mean))
-
-    open_parts, ends = [(0, q)], [0, q]
-    while open_parts:
-        first, last = open_parts.pop()
-        cuts = np.arange(first + 1, last)
-        left, right = freedoms[cuts] - freedoms[first], freedoms[last] - freedoms[cuts]
-        cuts = cuts[np.minimum(left, right) >= _LEAST]
-        if not cuts.size:
-            continue
-        gains = fit(first, last) - fit(first, cuts) - fit(cuts, last)
-        cut = int(cuts[gains.argmax()])
-        if gains.max() > price:
-            ends.append(cut)
-            open_parts += [(first, cut), (cut, last)]
-    groups = np.searchsorted(np.sort(ends)[1:-1], np.arange(q), side="right")
-    count = len(ends) - 1
-    says = f"one level for each of {count} runs of readings"
-    return _Levels(says, groups.astype(np.intp), None, 2 * count - 1)
 
 
 def _smooth(

@@ -64,7 +64,7 @@ def inverse(
     """The commands x behind readings y, with u(x) and an interval.
 
     Args:
-        fit: the calibration, of as many inputs as outputs.
+        fit: of as many inputs as outputs.
         readings: (..., m) in the measured unit, each the mean of ``repeats`` readings;
             of one output also (...).
         repeats: whole number from 1: the noise of a reading counts 1 / repeats.
@@ -75,10 +75,9 @@ def inverse(
 
     Returns:
         The command nearest to the measured one with the nearest output. Its interval is
-        Fieller's of a straight line; "band" of a curve, every command whose prediction
-        agrees with the reading, in pieces; "delta", symmetric and to first order, of
-        several inputs and of a slope that cannot be told from zero, where Fieller's is
-        not finite.
+        Fieller's of a line; "band" of a curve, every command whose prediction agrees
+        with the reading, in pieces; "delta", symmetric and to first order, of several
+        inputs and of a slope that may be zero, where Fieller's is not finite.
 
     Raises:
         ValueError: the noise is unknown; inputs and outputs differ in number; a reading
@@ -183,7 +182,7 @@ class _Curve:
         grid, off = self.grid, outputs - reading
         at_used = self.responses.outputs(self.used)[:, 0]
         nearest = self.used[np.abs(at_used - reading).argmin(), 0]
-        roots = self._crossings(grid, off, lambda x: self.at(x)[0] - reading)
+        roots = _crossings(grid, off, lambda x: self.at(x)[0] - reading)
         if len(roots):
             command = float(roots[np.abs(roots - nearest).argmin()])
         else:  # past a turn of the curve, or its end
@@ -192,8 +191,7 @@ class _Curve:
             grid = np.union1d(grid, np.linspace(*around, _GRID))
             outputs, allowed = self.at(grid)
             off = outputs - reading
-            best = int(np.nanargmin(np.abs(off) / (allowed + 1e-300)))
-            command = float(grid[best])
+            command = float(grid[np.nanargmin(np.abs(off) / (allowed + 1e-300))])
         order = np.argsort(np.append(grid, roots), kind="stable")
         grid = np.append(grid, roots)[order]
         beyond = np.append(np.abs(off) - allowed, -np.ones(len(roots)))[order]
@@ -203,7 +201,7 @@ class _Curve:
             outputs, allowed = self.at(commands)
             return np.abs(outputs - reading) - allowed
 
-        ends = self._crossings(grid, beyond, beyond_at)
+        ends = _crossings(grid, beyond, beyond_at)
         inside = beyond <= 0.0
         if not inside.any():
             least, most = np.nanmin(outputs), np.nanmax(outputs)
@@ -215,18 +213,6 @@ class _Curve:
             )
         ends = np.concatenate([grid[:1][inside[:1]], ends, grid[-1:][inside[-1:]]])
         return command, ends.reshape(-1, 2), "band"
-
-    def _crossings(self, grid: Array, values: Array, function: Any) -> Array:
-        """Where a function changes its sign between points of the grid, by halving."""
-        sign = values <= 0.0
-        finite = ~np.isnan(values)
-        here = np.flatnonzero((sign[1:] != sign[:-1]) & finite[1:] & finite[:-1])
-        low, high, first = grid[here], grid[here + 1], sign[here]
-        for _ in range(_HALVINGS if len(here) else 0):
-            middle = 0.5 * (low + high)
-            same = (function(middle) <= 0.0) == first
-            low, high = np.where(same, middle, low), np.where(same, high, middle)
-        return 0.5 * (low + high)
 
     def _of_line(self, reading: float) -> tuple[float, Array, str]:
         """Fieller's: where a square of the second degree is not positive."""
@@ -248,3 +234,15 @@ class _Curve:
         root = np.sqrt(max(half**2 - a * c, 0.0))
         ends = middle + spread * np.array([[half - root, half + root]]) / a
         return command, np.clip(ends, self.low, self.high), "Fieller"
+
+
+def _crossings(grid: Array, values: Array, function: Any) -> Array:
+    """Where a function changes its sign between points of the grid, by halving."""
+    sign, finite = values <= 0.0, ~np.isnan(values)
+    here = np.flatnonzero((sign[1:] != sign[:-1]) & finite[1:] & finite[:-1])
+    low, high, first = grid[here], grid[here + 1], sign[here]
+    for _ in range(_HALVINGS if len(here) else 0):
+        middle = 0.5 * (low + high)
+        same = (function(middle) <= 0.0) == first
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return 0.5 * (low + high)

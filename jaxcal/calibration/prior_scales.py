@@ -1,9 +1,8 @@
 """How large a machine's errors are, from its readings: the scales of a prior's groups.
 
-The prior says how errors of one kind compare with each other; how large they are
-altogether is seldom known. Here a factor for each of the model's ``error_groups()`` and
-the level of the noise make the readings most probable (marginal likelihood, the model
-linear about the fit), with what the model thinks of each factor beforehand.
+A factor for each of the model's ``error_groups()`` and the level of the noise make the
+readings most probable (marginal likelihood, the model linear about the fit), with what
+the model thinks of each factor beforehand.
 
 Sources: MacKay, 1992; Bishop, Pattern Recognition and Machine Learning, 3.5.
 """
@@ -17,7 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxcal.calibration.least_squares import FitProblem, FitSolution
+from jaxcal.calibration.fit_problem import FitProblem
+from jaxcal.calibration.least_squares import FitSolution
 from jaxcal.checks import Array
 from jaxcal.information.blocks import gram, triangle, without
 from jaxcal.information.singular import significant
@@ -84,12 +84,6 @@ def group_scales(
     return PriorScales(best, factors, inside[:num_groups, :num_groups])
 
 
-def _thought(groups: ErrorGroups) -> tuple[Array, Array]:
-    """(G + 1,) of the logarithms beforehand: the middle, and a standard deviation."""
-    wide = np.log(np.append(groups.spreads, _LEVEL))
-    return np.log(np.append(groups.medians, 1.0)), wide
-
-
 class _Evidence:
     """-2 log marginal likelihood of the logarithms (G + 1,) of the groups' factors and
     the level, with what is thought of them; the model is linear about a solution."""
@@ -101,7 +95,9 @@ class _Evidence:
         sized = groups.members[problem.free & (problem.precision > 0.0)]
         group = np.arange(len(groups.medians))
         self.members = sized == group[:, None]  # (G, s)
-        self.middle, self.wide = _thought(groups)
+        # Of the logarithms beforehand, (G + 1,): the middle, and a standard deviation.
+        self.middle = np.log(np.append(groups.medians, 1.0))
+        self.wide = np.log(np.append(groups.spreads, _LEVEL))
         self.most = np.append(np.full(len(group), _LARGEST), _MOST)  # (G + 1,)
         self.count, width = len(right), rows.shape[1]
         # All that the readings say is in a triangle; the rest of them is noise alone.
@@ -240,7 +236,7 @@ def covariance_of_scales(solution: FitSolution, scales: PriorScales) -> Array:
 
     variance = np.diagonal(scales.covariance)
     there = of_model.medians >= 1.0  # else misfit, which may not be there
-    above, tailed = _moments(variance, _thought(of_model)[1][:-1])
+    above, tailed = _moments(variance, np.log(of_model.spreads))
     skew = np.where(there, above, 0.0)
     wider = np.sqrt(np.where(there, tailed / variance, 1.0))
     values, axes = np.linalg.eigh(wider[:, None] * scales.covariance * wider)

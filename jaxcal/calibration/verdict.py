@@ -1,7 +1,6 @@
 """Whether a calibration may be used, why not, and what to do next: one answer for all.
 
-A rule returns a ``Reason`` that speaks against a calibration, or None. ``verdict`` is
-the answer of a model that has none of its own (``Model.verdict``).
+A rule returns a ``Reason`` that speaks against a calibration, or None.
 """
 
 from __future__ import annotations
@@ -425,18 +424,6 @@ def in_rows(rows: Sequence[int]) -> str:
     return f"row{'s' * (len(rows) > 1)} {named}{more}"
 
 
-def not_invertible(fit: Fit) -> Reason | None:
-    """A fit whose inverse ``command_for`` refuses, whatever is desired."""
-    from jaxcal.calibration.inverse import no_inverse
-
-    why = no_inverse(fit)
-    if not why:
-        return None
-    return Reason(
-        f"command_for refuses: {why}.", "measure over a wider range, or with less noise"
-    )
-
-
 def _in_noise(fit: Fit, white: Array) -> bool:
     """Whether the fit took residuals in noise as these (N, m), no row unlike others."""
     return bool(np.isclose((white**2).sum(), fit.square, rtol=1e-6))
@@ -468,10 +455,13 @@ def verdict(fit: Fit) -> Verdict:
     """Good if no rule speaks against the fit and its inverse is not refused. Where
     readings were not measured, that is the only reason given: the others would follow
     from it."""
+    from jaxcal.calibration.inverse import no_inverse
+
     first = never_measured(fit) or computed(fit)
     reasons = [first] if first else [reason for rule in RULES if (reason := rule(fit))]
-    if not reasons and (refusal := not_invertible(fit)):
-        reasons = [refusal]
+    if not reasons and (refusal := no_inverse(fit)):
+        remedy = "measure over a wider range, or with less noise"
+        reasons = [Reason(f"command_for refuses: {refusal}.", remedy)]
     use = USE if fit.num_outputs <= fit.num_inputs else _PREDICT
     return Verdict(
         good=not reasons,

@@ -157,18 +157,6 @@ class Ascent:
 
     def slopes(self, commands: Array, metric: Array) -> Array:
         """(N, n) of d by the commands, in shares of the limits."""
-        total, many = np.zeros_like(commands), _filled(commands)
-        for s, member in enumerate(self.problem.members):
-            basis = member.white.basis
-            unwhitened = basis @ metric[s] @ basis.T
-            exact = self.block_makers[s].leverage_slopes(many, unwhitened)
-            if exact is None:
-                return self._differences(commands, metric)
-            total += exact[: len(commands)]
-        return total * self.box.span
-
-    def _differences(self, commands: Array, metric: Array) -> Array:
-        """``slopes`` where the model has no derivative of its own."""
         box, (count, n) = self.box, commands.shape
         moving = len(box.allowed.limits) if box.surface else n  # joints, then labels
         rough = _ROUGH if self.offer.model.resolution else _STEP

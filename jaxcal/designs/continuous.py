@@ -29,7 +29,7 @@ from jaxcal.deadline import Deadline
 from jaxcal.designs.ascent import POOL, Ascent, ascent_of, climbed, swapped
 from jaxcal.designs.bound import upper_bound
 from jaxcal.designs.box import Allowed, affordable, box_of
-from jaxcal.models.affine import Affine
+from jaxcal.models.linear import Affine
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import ScenarioCriterion

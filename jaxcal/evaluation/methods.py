@@ -28,7 +28,7 @@ from jaxcal.evaluation.report import (
     moments,
 )
 from jaxcal.information.regression import log_det_gram
-from jaxcal.models.affine import Affine
+from jaxcal.models.linear import Affine
 from jaxcal.selection.problem import make_problems
 
 Indices = NDArray[np.int64]

@@ -1,17 +1,15 @@
 """Information blocks: their log det, rank and whitening.
 
 Measuring candidate i adds ``B_i.T @ B_i`` to the information, B_i a block (q, p): q
-readings, p parameters. A prior of precision P comes as a root (r, p) with
-``root.T @ root = P``, which is one more block. An affine posture is the block [u, 1].
+readings, p parameters. A prior of precision P is one more block, a root (r, p) with
+``root.T @ root = P``. An affine posture is the block [u, 1].
 
-Columns that are the same in every block (the ones that multiply a bias) are used to
-centre the other columns: a linear map of the parameters with determinant one, exact to
-the last place of the numbers given, so encoder pulses far from zero keep their digits.
-
-Columns are first divided by powers of two where they could over- or underflow, which is
-exact. A row far from all others (1e7 beside 1) must not hide what distinguishes these:
-columns with such rows are centred where rows are densest and made orthogonal first, so
-that the other rows keep their digits.
+Columns that are the same in every block (the ones that multiply a bias) centre the
+others: a linear map of the parameters with determinant one, exact to the last place, so
+encoder pulses far from zero keep their digits. Columns that could over- or underflow
+are first divided by powers of two. A row far from all others (1e7 beside 1) must not
+hide what distinguishes these: columns with such rows are centred where rows are densest
+and made orthogonal first.
 """
 
 from __future__ import annotations
@@ -218,16 +216,13 @@ def prior_root(precision: Array) -> Array:
 def rank_of_blocks(
     blocks: Array, root: Array, size: Array | None = None
 ) -> tuple[list[int], Array]:
-    """Rank and natural log det, -inf where singular, of information blocks.
+    """Ranks and natural log det (S,), -inf where singular, of information blocks.
 
     Args:
         blocks: (S, N, q, p), the N of each of S sets measured together.
         root: (r, p) of the prior precision, r = 0 without one.
         size: (p,) of what the blocks were computed beside, the largest of a model's
             derivatives; None: they are the caller's own numbers.
-
-    Returns:
-        (S,) of both.
     """
     if not blocks.shape[1]:  # the prior alone
         blocks = np.broadcast_to(root, (len(blocks), 1, *root.shape))
@@ -305,12 +300,11 @@ class WhiteBlocks(NamedTuple):
 def whiten(
     blocks: Array, usable: Mask, root: Array, *, computed: bool = False
 ) -> list[WhiteBlocks | None]:
-    """Blocks in coordinates where everything measured at once has information I.
+    """Blocks in coordinates where everything measured at once has information I; of
+    every set, read-only, None where all together are singular.
 
     With T = prior + sum of the usable ``B_i.T @ B_i`` = R.T R the whitened block is
-    ``B_i R^-1``, and log det of any selection is its whitened log det plus log det T. A
-    linear map of the parameters rotates the whitened blocks and nothing else.
-
+    ``B_i R^-1``, and log det of any selection is its whitened log det plus log det T.
     R is Cholesky's factor of ``rows.T @ rows``, the cheapest; where columns are nearly
     dependent, or rows far apart, that of rotations.
 
@@ -319,9 +313,6 @@ def whiten(
         usable: (S, M) which count.
         root: (r, p) of the prior precision.
         computed: the blocks are rounded themselves, as a model's derivatives are.
-
-    Returns:
-        One of every set, read-only; None where T is singular.
     """
     sets, num, q, p = blocks.shape
     centred = _centred(blocks, usable, root, look=True)

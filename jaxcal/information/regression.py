@@ -1,13 +1,10 @@
 """The calibration model ``y = A u + b`` as a linear regression.
 
-Every quantity jaxcal maximises, bounds or reports starts here. A posture is a command
-``u`` (n inputs); its regressor is ``z = [u, 1]``; the m outputs share that regressor,
-so the full regression matrix is a Kronecker product and everything reduces to the
-small matrix ``Z`` of stacked regressors:
+The m outputs of a command ``u`` share the regressor ``z = [u, 1]``, so the regression
+matrix is a Kronecker product and all follows from ``Z`` of stacked regressors:
 
     S = A.T @ A  ~  I_m (x) (Z.T @ Z)      log det S = m log det(Z.T @ Z)
 
-Functions take and return numpy arrays in float64, in the unit of the caller's commands.
 Leading axes (``...``) are batches. Source: paper, Equations 2, 9 and the D-criterion.
 """
 
@@ -44,15 +41,9 @@ def regressors(commands: ArrayLike) -> Array:
 def regression_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Array:
     """Regression matrix of the stacked measurements ``[y_1; y_2; ...; y_N]``.
 
+    (..., m N, m (n + 1)) of commands (..., N, n), m as many as inputs by default.
     Columns are A row by row, then the biases, ``[a11 a12 a13 a21 ... a33 | bx by bz]``
     (Equation 9); rows the outputs of posture 1, then of posture 2, ... (Equation 2).
-
-    Args:
-        commands: (..., N, n).
-        num_outputs: m; as many as inputs when not given.
-
-    Returns:
-        (..., m N, m (n + 1)).
     """
     commands = _as_commands(commands)
     *batch, num_postures, num_inputs = commands.shape
@@ -80,15 +71,9 @@ def log_det_gram(commands: ArrayLike) -> Array:
 def log_det_information(
     commands: ArrayLike, num_outputs: int | None = None
 ) -> float | Array:
-    """Log-determinant of the information matrix ``S``, ``m log det(Z.T @ Z)``.
-
-    Args:
-        commands: (..., N, n) in the unit the value is to be quoted in.
-        num_outputs: m; as many as inputs when not given.
-
-    Returns:
-        A float, or (...,) for batches; natural log, ``-inf`` where singular.
-    """
+    """Natural log det of the information matrix ``S``, ``m log det(Z.T @ Z)``, of
+    commands (..., N, n): a float, or (...,) for batches; ``-inf`` where singular. m is
+    ``num_outputs``, as many as inputs when not given."""
     commands = _as_commands(commands)
     m = commands.shape[-1] if num_outputs is None else num_outputs
     value = m * log_det_gram(commands)

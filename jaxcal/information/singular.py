@@ -1,15 +1,11 @@
 """What is not determined: the one rule, and such a direction in words.
 
-Every judgement of what is singular is made here. It is of columns in comparable units,
-and in one of two ways, by how exact the numbers are:
-
-- the caller's own numbers (commands, blocks) are exact to half a unit in the last place
-  of their size, so a direction no wider than that says nothing (``rank_rule``,
-  ``null_directions``);
-- what was computed from them (derivatives, factors) is exact to about 1e-13, so what is
-  below ``SINGULAR`` of the largest singular value says nothing (``significant``).
-
-Limits elsewhere choose an algorithm or end an iteration; none decides what is known.
+Every judgement of what is singular is made here, of columns in comparable units. The
+caller's own numbers (commands, blocks) are exact to half a unit in the last place of
+their size, so a direction no wider than that says nothing (``rank_rule``,
+``null_directions``). What was computed from them (derivatives, factors) is exact to
+about 1e-13: what is below ``SINGULAR`` of the largest singular value says nothing
+(``significant``).
 """
 
 from __future__ import annotations
@@ -59,14 +55,10 @@ def _lengths(
 def rank_rule(
     columns: Array, largest: Array, count: int | None = None, computed: bool = False
 ) -> tuple[list[int], Array]:
-    """(S,) ranks and natural log det (-inf below rank p) of ``columns.T @ columns``.
-
-    Args:
-        columns: (S, R, p) stacked blocks of S sets, centred.
-        largest: (S, p) largest entry of each column before centring.
-        count: rows that rounding errors add up over; R when not given.
-        computed: the columns are rounded themselves, as a model's derivatives are.
-    """
+    """(S,) ranks and natural log det (-inf below rank p) of ``columns.T @ columns``, of
+    S sets of centred columns (S, R, p) and their ``largest`` entries (S, p) before
+    that. Rounding errors add up over ``count`` rows, R by default; ``computed`` columns
+    are rounded themselves, as a model's derivatives are."""
     num_rows, p = columns.shape[1:]
     lengths, rounding = _lengths(columns, largest, count or num_rows, computed)
     ranks = [p] * len(columns)

@@ -8,17 +8,15 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxcal.models.affine import Affine
-from jaxcal.models.from_dict import from_dict
 from jaxcal.models.identifiability import Identifiability, identifiability
-from jaxcal.models.model import Model
+from jaxcal.models.linear import Affine, Linear, Polynomial
+from jaxcal.models.model import Model, from_dict
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 
 if TYPE_CHECKING:
     from jaxcal.models.from_jax import FromJax
     from jaxcal.models.function import FromFunction
-    from jaxcal.models.linear import Linear, Polynomial
 
 __all__ = [
     "Affine",
@@ -38,8 +36,6 @@ __all__ = [
 _HOME = {
     "FromFunction": "jaxcal.models.function",
     "FromJax": "jaxcal.models.from_jax",
-    "Linear": "jaxcal.models.linear",
-    "Polynomial": "jaxcal.models.linear",
 }
 
 

@@ -1,14 +1,12 @@
 """Derivatives by finite differences with steps chosen from the noise of f.
 
-Noise: the values at seven points so close together that f is a polynomial there; what
-their higher differences leave is the noise of f. Values of few digits were printed: the
-unit of the last one is noise. Step: derivatives of fourth order at
-steps halved until noise is all that changes them. The step taken is the one where the
-change from one step to the next and what noise does to it are least together, or the
-shortest one where both are below 1e-8: the shorter a step, the fewer kinks of f it
-meets.
-Parameters that may go to one side only, as a friction of zero, get differences to that
-side.
+Noise: what higher differences leave of the values at seven points so close together
+that f is a polynomial there. Values of few digits were printed: the unit of the last
+one is noise. Step: derivatives of fourth order at steps halved until noise is all that
+changes them; taken is the one where the change from one step to the next and what noise
+does to it are least together, or the shortest where both are below 1e-8, which meets
+the fewest kinks. Parameters that may go to one side only, as a friction of zero, get
+differences to that side.
 
 Sources: Moré and Wild, Estimating computational noise, 2011; Ridders, 1982.
 """

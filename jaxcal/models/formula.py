@@ -53,11 +53,7 @@ _CONSTANTS = {"pi": np.pi, "e": np.e}
 
 def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str], dict[str, Levels]]:
     """Term -> its factors, in the order of the formula; the names that they use; and
-    the levels of those that are categories.
-
-    Raises:
-        ValueError: formulaic cannot read it, or a factor holds something else.
-    """
+    the levels of those that are categories."""
     with needs("models", "a formula"):
         from formulaic import Formula
         from formulaic.errors import FormulaicError

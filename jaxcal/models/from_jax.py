@@ -94,26 +94,6 @@ class FromJax(Model):
         """(N, q, n)."""
         return self._run(2, commands, parameters)
 
-    def leverage_slopes(
-        self, commands: Array, parameters: Array, white: Array, metric: Array
-    ) -> Array:
-        """(N, n) by JAX."""
-        commands = as_commands(self, commands)
-        import jax
-
-        with jax.enable_x64(True):
-            return np.array(self._leverage(commands, parameters, white, metric))
-
-    @functools.cached_property
-    def _leverage(self) -> Callable[..., Any]:
-        import jax
-
-        def leverage(command: Any, parameters: Any, white: Any, metric: Any) -> Any:
-            block = white @ jax.jacfwd(self._readings, argnums=1)(command, parameters)
-            return (block @ metric * block).sum()
-
-        return jax.jit(jax.vmap(jax.grad(leverage), in_axes=(0, None, None, None)))
-
     def _readings(self, command: Any, parameters: Any) -> Any:
         """(q,) f of one command, of a scalar too."""
         import jax.numpy as jnp

@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.checks import (
     Array,
@@ -34,7 +34,6 @@ from jaxcal.models.model import (
 from jaxcal.models.runs import CommandLine, Runs
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
 
-SIDES = tuple(STENCILS)
 _PILOTS = 4  # commands at which steps are chosen
 _ROUGH = 0.1  # of the largest derivative: a difference between orders that is told
 _LONG = 512  # rows of a table that is remembered as a whole
@@ -278,30 +277,20 @@ class FromFunction(Model):
     def _by_parameters(self, rows: Array, theta: Array) -> Array:
         steps = self._steps_for("parameters", rows, theta)
 
-        def jobs(at: Array, columns: Sequence[int], side: str = "") -> list[Any]:
-            moved = []
-            for j in columns:
-                for offset in STENCILS[side or steps.sides[j]].offsets * steps.steps[j]:
-                    point = theta.copy()
-                    point[j] += offset
-                    moved.append((at, point))
-            return moved
+        def jobs(j: int, side: str) -> list[Any]:
+            offsets = STENCILS[side].offsets * steps.steps[j]
+            moved = theta + offsets[:, None] * np.eye(len(theta))[j]
+            return [(rows, point) for point in moved]
 
-        values = self._run(jobs(rows, range(len(theta))))
-        sides = self._sides(steps, rows)
-        failed = np.asarray(np.isnan(np.array(values)).any(axis=(0, 2)))
-        if failed.any():
-            failed[failed] = ~np.isnan(self.predict(rows[failed], theta)).any(axis=1)
-        for j in range(len(theta)):  # at an edge of what f takes, to the other side
-            its = values[4 * j : 4 * j + 4]
-            for side in ("forward", "backward"):
-                lost = failed & np.isnan(np.array(its)).any(axis=(0, 2))
-                if not lost.any():
-                    break
-                tried = self._run(jobs(rows[lost], [j], side))
-                for old, new in zip(its, tried, strict=True):
-                    old[lost] = new
-                sides[j, lost] = SIDES.index(side)
+        every = [job for j, side in enumerate(steps.sides) for job in jobs(j, side)]
+        values, sides = self._run(every), [*steps.sides]
+        if np.isnan(np.array(values)).any():  # at an edge of what f takes?
+            answered = ~np.isnan(self.predict(rows, theta)).any(axis=1)
+            for j in range(len(theta)):
+                its = slice(4 * j, 4 * j + 4)
+                for side in ("forward", "backward"):
+                    if np.isnan(np.array(values[its])[:, answered]).any():
+                        values[its], sides[j] = self._run(jobs(j, side)), side
         return self._slopes(steps, rows, values, sides)
 
     def _by_commands(self, rows: Array, theta: Array) -> Array:
@@ -312,31 +301,23 @@ class FromFunction(Model):
         points = rows + moves.reshape(-1, 1, rows.shape[1])
         values = self._run([(points.reshape(-1, rows.shape[1]), theta)])[0]
         values = values.reshape(len(points), len(rows), -1)
-        return self._slopes(steps, rows, [*values], self._sides(steps, rows))
-
-    @staticmethod
-    def _sides(steps: Differences, rows: Array) -> NDArray[np.int8]:
-        """(p, N) places in ``SIDES``."""
-        places = [SIDES.index(side) for side in steps.sides]
-        return np.repeat(np.array(places, np.int8)[:, None], len(rows), axis=1)
+        return self._slopes(steps, rows, [*values], steps.sides)
 
     def _slopes(
         self,
         steps: Differences,
         rows: Array,
         values: list[Array],
-        sides: NDArray[np.int8],
+        sides: Sequence[str],
     ) -> Array:
-        """(N, q, p) of 4 p values (N, q), by ``sides`` (p, N), places in ``SIDES``."""
+        """(N, q, p) of 4 p values (N, q), by ``sides`` of the p."""
         slopes = np.empty((*values[0].shape, len(steps.steps)))
         rough = np.empty_like(slopes)
         for j, step in enumerate(steps.steps):
+            stencil = STENCILS[sides[j]]
+            weights = np.array([stencil.fine, stencil.coarse]) / step
             stack = np.array(values[4 * j : 4 * j + 4])
-            for place in np.flatnonzero(np.bincount(sides[j])):
-                at, stencil = sides[j] == place, STENCILS[SIDES[place]]
-                weights = np.array([stencil.fine, stencil.coarse]) / step
-                fine, coarse = combined(stack[:, at], weights, self.periods)
-                slopes[at, :, j], rough[at, :, j] = fine, coarse
+            slopes[..., j], rough[..., j] = combined(stack, weights, self.periods)
         with np.errstate(invalid="ignore"):
             largest = np.nanmax(np.abs(slopes), axis=0, initial=0.0)  # (q, p)
             apart = np.abs(slopes - rough)

@@ -69,16 +69,15 @@ def identifiability(
     prior: Prior | None = None,
     parameters: Sequence[str] | None = None,
 ) -> Identifiability:
-    """Find every direction of the parameters that no candidate excites.
+    """Find every direction of the parameters that no candidate (N, n) excites.
 
     Args:
         model: with p parameters.
         candidates: (N, n) commands.
         noise: matters where commands are unknown in every measurement.
-        prior: the model is evaluated at its mean, without a prior at the nominal
-            parameters. It counts as information where its std is finite; parameters
-            that it fixes are left out. Without a prior only measurements count, and
-            parameters that the model's default prior fixes are held.
+        prior: the model is evaluated at its mean, else at the nominal parameters. It
+            counts where its std is finite, and parameters that it fixes are left out.
+            Without one those that the model's default prior fixes are held.
         parameters: names of interest; the others are taken as known.
     """
     commands = table("candidates", candidates)

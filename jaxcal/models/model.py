@@ -1,8 +1,6 @@
 """``Model``: what comes out of a command, ``y = f(u; theta)``, and what follows.
 
-A model gives its names, outputs and derivatives; everything else that ``select`` and
-``identify`` ask has a default here. ``as_model`` gives the defaults to an object that
-is not of this class.
+``as_model`` gives the defaults of ``Model`` to an object that is not of this class.
 """
 
 from __future__ import annotations
@@ -10,13 +8,22 @@ from __future__ import annotations
 import abc
 import functools
 import os
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import Array, array_of, axis_names, one_or_each, require_none
+from jaxcal.checks import (
+    Array,
+    array_of,
+    axis_names,
+    one_of,
+    one_or_each,
+    require_none,
+)
+from jaxcal.extras import installed
 from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.tables import COMMANDS, header_of, of_frame
@@ -25,6 +32,9 @@ Rows = NDArray[np.intp]
 Theta = ArrayLike | None  # parameters (p,); None: the nominal ones
 
 _NOTHING_KNOWN = Prior(np.inf)
+_GROUP = "jaxcal.models"  # entry points by which others, as jaxcal.arms, add kinds
+_KINDS = {"affine": "Affine", "linear": "Linear", "polynomial": "Polynomial"}
+_UNWRITTEN = ("function", "jax")  # kinds that hold a function
 
 
 class ErrorGroups(NamedTuple):
@@ -68,6 +78,17 @@ class Model(abc.ABC):
         def num_outputs(self) -> int: ...
 
     inputs: Any = ()
+    linear: ClassVar[Any] = False  # ``f(u; theta) = J(u) theta``, J exact
+    multiplicity: ClassVar[Any] = 0  # m where all outputs share one regressor
+    relative: ClassVar[Any] = False  # readings are relative to the commands, as turns
+    periods: ClassVar[Any] = None  # (q,) of readings that wrap, as 360; inf: does not
+    resolution: ClassVar[Any] = 0.0  # share by which derivatives by differences err
+    rounding: ClassVar[Any] = None  # (q,) std of its own noise, as of printed digits
+    sensed: ClassVar[Any] = slice(0, 0)  # columns of commands that a reading brings
+    placed: ClassVar[Any] = ()  # parameters of what stands around it
+    slips: ClassVar[Any] = ()  # parameters that change when something slips
+    misfit_std: ClassVar[Any] = 0.0  # of a reading, what ``with_misfit`` leaves
+    fits_misfit: ClassVar[Any] = False  # ``with_misfit`` is fitted without a prior
 
     # -- f and its derivatives ---------------------------------------------------------
 
@@ -82,15 +103,6 @@ class Model(abc.ABC):
     @abc.abstractmethod
     def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, n) derivative of the outputs by the commands."""
-
-    def leverage_slopes(
-        self, commands: Array, parameters: Array, white: Array, metric: Array
-    ) -> Array | None:
-        """(N, n) slopes by commands of ``trace(B metric B.T)``, ``B = white @ J``.
-
-        J is the Jacobian (q, p) at a command, white (q, q). None: by differences.
-        """
-        return None
 
     # -- names -------------------------------------------------------------------------
 
@@ -135,11 +147,9 @@ class Model(abc.ABC):
         return None
 
     def parameter_sizes(self) -> Array:
-        """(p,) in which derivatives are compared: those below 1e-14 are rounding.
-
-        The default prior's std, else the nominal value; NaN where neither says how
-        large, or where derivatives are exact: then zero alone is no effect.
-        """
+        """(p,) in which derivatives are compared, those below 1e-14 are rounding: the
+        default prior's std, else the nominal value; NaN where neither says how large,
+        or where derivatives are exact: then zero alone is no effect."""
         if self.linear:
             return np.full(len(self.names), np.nan)
         nominal = np.abs(self.nominal)
@@ -158,12 +168,9 @@ class Model(abc.ABC):
         return None
 
     def log_size(self, commands: Array, parameters: Array) -> Array | None:
-        """Logarithm (N,) of what contacts' readings, near zero, grow with.
-
-        A fit compares them (what is below four times ``default_noise``) with the
-        machine's size, or a smaller machine would always fit better. None: readings are
-        as large as they are.
-        """
+        """Logarithm (N,) of what contacts' readings, near zero, grow with. A fit
+        compares them (below four times ``default_noise``) with the machine's size, or a
+        smaller one would always fit better. None: readings are as large as they are."""
         return None
 
     def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
@@ -172,25 +179,9 @@ class Model(abc.ABC):
 
     # -- readings that wrap, and a model that can only be run --------------------------
 
-    @property
-    def periods(self) -> Array | None:
-        """(q,) of readings that wrap, as 360 degrees, inf of others; None: of none."""
-        return None
-
     def wrapped(self, off: Array, commands: Array) -> Array:
         """(N, q) differences of readings, those that wrap within half a period."""
         return within_half(off, self.periods)
-
-    @property
-    def resolution(self) -> float:
-        """Share by which derivatives are off where they are differences, else 0."""
-        return 0.0
-
-    @property
-    def rounding(self) -> Array | None:
-        """(q,) standard deviation of the model's own noise, as of a program that prints
-        six digits; None: as exact as numbers are."""
-        return None
 
     def unanswered(
         self, commands: Array, parameters: ArrayLike | None = None
@@ -200,22 +191,13 @@ class Model(abc.ABC):
 
     # -- the commands and readings of a fit or a choice --------------------------------
 
-    @property
-    def sensed(self) -> slice:
-        """Columns of the commands that come with a reading: what was touched, seen."""
-        return slice(0, 0)
-
     def anew(self, commands: Array, measured: Array) -> Model:
         """The model as ``prepared`` has it, where its sensor stood before forgotten."""
         return self
 
     def prepared(self, commands: Array, measured: Array | None = None) -> Model:
-        """This model where the commands (and readings) show that its sensor stands.
-
-        Raises:
-            ValueError: no such machine can take the commands, or give the readings; it
-                says which.
-        """
+        """This model where the commands (and readings) show that its sensor stands; a
+        ValueError where no such machine takes the commands, or gives the readings."""
         self.require_commands(commands)
         return self
 
@@ -233,20 +215,10 @@ class Model(abc.ABC):
 
     # -- linear models -----------------------------------------------------------------
 
-    @property
-    def linear(self) -> bool:
-        """Whether ``f(u; theta) = J(u) theta``, and the derivatives J are exact."""
-        return False
-
     def centred(self, centre: Array) -> Array | None:
         """(p, p) with ``f(u; theta) = f(u - centre; centred(centre) @ theta)``, or
         None."""
         return None
-
-    @property
-    def multiplicity(self) -> int:
-        """m where ``blocks`` hold a regressor that all outputs share, else 0."""
-        return 0
 
     def blocks(self, commands: ArrayLike) -> Array:
         """(..., N, 1, r) of each output by itself, with unit noise."""
@@ -257,16 +229,6 @@ class Model(abc.ABC):
         return None
 
     # -- what no parameter explains ----------------------------------------------------
-
-    @property
-    def misfit_std(self) -> float:
-        """Standard deviation of a reading by what ``with_misfit()`` does not hold."""
-        return 0.0
-
-    @property
-    def fits_misfit(self) -> bool:
-        """Whether without a prior the parameters of ``with_misfit()`` are fitted."""
-        return False
 
     def with_misfit(self) -> Model:
         """This model with more parameters, which come last: what the others leave."""
@@ -282,21 +244,6 @@ class Model(abc.ABC):
 
     # -- a calibrated machine ----------------------------------------------------------
 
-    @property
-    def placed(self) -> tuple[str, ...]:
-        """Names of the parameters of what stands around the machine."""
-        return ()
-
-    @property
-    def slips(self) -> tuple[str, ...]:
-        """Names of the parameters that change alone when something slips."""
-        return ()
-
-    @property
-    def relative(self) -> bool:
-        """Whether readings are relative to the commands, as the turns of a pose."""
-        return False
-
     def targets(
         self, desired: Array, start: Array | None
     ) -> Callable[[Array, Rows], Array]:
@@ -309,27 +256,8 @@ class Model(abc.ABC):
         of model; None: by the rules for every model."""
         return None
 
-    def of_chain(self, fit: Any, tip: str) -> dict[str, Any]:
-        """The fields of a ``jaxcal.Calibration`` that are of one of several chains."""
-        raise ValueError(f"the model must be Chains, got {self._kind}")
-
     def calibrated(self, parameters: ArrayLike) -> Model:
         """The machine whose nominal is this one's with ``parameters``."""
-        raise self._no_arm()
-
-    def writable(self) -> Model:
-        """This model without the parameters that no file of ``write`` holds."""
-        return self
-
-    def standing_as(self, other: Any, parameters: Array, commands: Array) -> Array:
-        """(p,) ``parameters`` with the machine moved as a whole to where ``other`` is;
-        ``commands`` (N, n) show the range of what has no limits."""
-        return parameters
-
-    def write(
-        self, form: str, path: Any, parameters: ArrayLike, *, force: bool = False
-    ) -> str:
-        """Write the machine with ``parameters`` in a form that its controller reads."""
         raise self._no_arm()
 
     @property
@@ -363,11 +291,8 @@ class _Adapter(Model):
 
 
 def as_model(model: Any) -> Model:
-    """``model`` itself, or with the defaults of ``Model`` if it is another object.
-
-    Raises:
-        ValueError: it is a class, or lacks a method that has no default.
-    """
+    """``model`` itself, or with the defaults of ``Model`` if it is another object; a
+    ValueError where it is a class, or lacks a method that has no default."""
     if isinstance(model, Model):
         return model
     methods = ("predict", "jacobian", "command_jacobian")
@@ -450,3 +375,30 @@ def checked_periods(periods: ArrayLike, count: int) -> Array:
     given = one_or_each("periods", periods, count)
     require_none(~(given > 0.0), given, "periods must be positive (inf: does not wrap)")
     return given
+
+
+def from_dict(data: Mapping[str, Any]) -> Model:
+    """The model that ``to_dict`` wrote; a ValueError for an unknown kind, a key that is
+    missing, unknown or of another type, and a model that a function made."""
+    if not isinstance(data, Mapping):
+        raise ValueError(f"a model must be a JSON object with a kind, got {data!r}")
+    fields = dict(data)
+    kind = fields.pop("kind", None)
+    kinds = (*_KINDS, *_UNWRITTEN)
+    others = {} if kind in kinds else installed(_GROUP)
+    kind = one_of("kind of the model", kind, (*kinds, *others))
+    if kind in _UNWRITTEN or fields.get("features", "") is None:
+        raise ValueError(
+            "the model contains a function, which cannot be saved: pass the model, "
+            "model=..."
+        )
+    if kind == "linear":  # a formula names its own
+        fields.pop("terms", None)
+    room = sys.modules["jaxcal.models"]  # which loads a model's module when asked
+    make = others[kind].load() if kind in others else getattr(room, _KINDS[kind])
+    try:
+        return cast("Model", make(**fields))
+    except TypeError as error:
+        raise ValueError(
+            f"a model of kind {kind} must hold values as to_dict writes them: {error}"
+        ) from error

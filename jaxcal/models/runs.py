@@ -1,8 +1,7 @@
 """Runs of a caller's function: in this process or several, with failures.
 
-A job is some commands with one set of parameters. A run that raises, or whose numbers
-are not finite, is a failure with a reason; another shape than that of the others is an
-error.
+A run that raises, or whose numbers are not finite, is a failure with a reason; another
+shape than that of the others is an error.
 """
 
 from __future__ import annotations
@@ -35,14 +34,9 @@ class _RunError(Exception):
 
 
 class CommandLine:
-    """A program that prints the readings of one command.
-
-    Args:
-        words: the program and its arguments, in which ``{name}`` stands for the value
-            of a command or parameter of that name; one text is split as a shell does.
-        names: of commands and parameters, in this order.
-        timeout: seconds after which a run has failed.
-    """
+    """A program that prints the readings of one command: its ``words``, in which
+    ``{name}`` stands for a value, of ``names`` of commands, then parameters; one text
+    is split as a shell does. A run fails after ``timeout`` seconds."""
 
     def __init__(
         self, words: str | Sequence[str], names: Sequence[str], timeout: float | None

@@ -69,12 +69,9 @@ class Prior:
             )
 
     def sized(self) -> Prior:
-        """This prior for an arm whose tolerances are not known.
-
-        Its standard deviations then say how errors compare within a group: a factor
-        each of lengths, turns of the axes, zeros of the joints and their compliance
-        follows from the readings by marginal likelihood.
-        """
+        """This prior for an arm whose tolerances are not known: a factor each of its
+        lengths, turns of the axes, zeros of the joints and compliance follows from the
+        readings by marginal likelihood."""
         return dataclasses.replace(self, by_data=True)
 
     def resolve(self, model: Any) -> ResolvedPrior:
@@ -179,11 +176,8 @@ class Noise:
     def whitening(
         self, count: int, num_outputs: int, command_jacobian: ArrayLike | None = None
     ) -> Array:
-        """W (N, q, q) with ``W Sigma W.T = I``: information blocks are ``W @ J``.
-
-        A row is zero where nuisance commands leave nothing to learn from it.
-        ``command_jacobian`` (N, q, n) of the model is needed with ``command_std``.
-        """
+        """W (N, q, q) with ``W Sigma W.T = I``, a row zero where nuisance commands
+        leave nothing to learn; ``command_std`` needs ``command_jacobian`` (N, q, n)."""
         shape = (count, num_outputs, num_outputs)
         if self.covariance is None and self.command_std is None:
             white = np.empty(shape)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.designs.travel import Motion, fastest_tour, travel_times
-from jaxcal.models.affine import Affine
+from jaxcal.models.linear import Affine
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.outputs.messages import choice_text, numbers

@@ -12,7 +12,7 @@ from scipy import optimize, stats
 
 import jaxcal
 from jaxcal.calibration import Calibration, identify
-from jaxcal.calibration.losses import LOSSES, Loss, constants
+from jaxcal.calibration.fit_problem import LOSSES, Loss, constants
 from jaxcal.calibration.verdict import Verdict, verdict
 from jaxcal.models import (
     Affine,

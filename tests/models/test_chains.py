@@ -5,6 +5,7 @@ import functools
 import json
 import re
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.arms.files.urdf import joints_of
+from jaxcal.arms.written import of
 from jaxcal.models import (
     Board,
     Chains,
@@ -270,8 +272,8 @@ def test_chains_that_share_no_joint_must_not_name_one_alike():
         Chains.of({"a": arm, "b": other})
     with pytest.raises(ValueError, match="at least two arms"):
         Chains.of({"a": arm})
-    with pytest.raises(ValueError, match="must be Chains"):
-        arm.of_chain(None, "a")
+    with pytest.raises(ValueError, match="must be Chains, got SerialChain"):
+        of(SimpleNamespace(model=arm), "a")
 
 
 def test_a_file_keeps_which_sensor_is_one(robot):

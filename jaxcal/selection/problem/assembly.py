@@ -17,7 +17,7 @@ from jaxcal.information.blocks import (
     whiten,
 )
 from jaxcal.information.singular import SINGULAR, directions_in_words, require_excited
-from jaxcal.models.affine import Affine
+from jaxcal.models.linear import Affine
 from jaxcal.selection.criteria import (
     CRITERIA,
     Coordinates,

@@ -64,10 +64,6 @@ class Blocks:
     def require_identified(self, measured: ArrayLike | None) -> None:
         """Refuse what candidates leave unknown, by the names of parameters."""
 
-    def leverage_slopes(self, commands: Array, metric: Array) -> Array | None:
-        """(N, n) slopes of ``trace(B metric B.T)`` by commands, where there are any."""
-        return None
-
     def _of(self, values: Array) -> Array:
         if self._model is not None:
             return self._model.blocks(values) / self._std
@@ -157,15 +153,6 @@ class _ModelBlocks(Blocks):
         noise = self._noise
         same = self._read is noise and noise.command_std is None
         return None if same and not noise.by_row else self.used
-
-    def leverage_slopes(self, commands: Array, metric: Array) -> Array | None:
-        if self._read.command_std is not None:
-            return None
-        p = len(self._free)
-        whole = np.zeros((p, p))
-        whole[np.ix_(self._free, self._free)] = metric
-        white = self._read.whitening(1, self._model.num_outputs)[0]
-        return self._model.leverage_slopes(commands, self._mean, white, whole)
 
     def require_identified(self, measured: ArrayLike | None) -> None:
         if np.diagonal(self._precision).all():

@@ -22,7 +22,7 @@ from jaxcal.checks import (
     require_size,
     whole_number,
 )
-from jaxcal.models.affine import Affine
+from jaxcal.models.linear import Affine
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.predictions import answered
 from jaxcal.models.uncertainty import Prior, as_noise
