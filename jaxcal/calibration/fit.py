@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import warnings
@@ -65,7 +66,7 @@ class Fit:
             if isinstance(value, np.ndarray):
                 fields[name] = value = np.array(value)
                 value.flags.writeable = False
-        fields["provenance"] = _copied(self.provenance)
+        fields["provenance"] = copy.deepcopy(dict(self.provenance))
 
     # -- parameters --------------------------------------------------------------------
 
@@ -290,11 +291,14 @@ class Fit:
     @property
     def unseen(self) -> Array:
         """(z, P) directions that nothing determines, as ``linear`` has the slopes."""
-        null = self.unidentified
-        null = np.zeros((0, len(self.estimate))) if null is None else null
         if self.centre is None:
-            return null
-        return null @ np.asarray(self.model.centred(self.centre)).T
+            return self._null
+        return self._null @ np.asarray(self.model.centred(self.centre)).T
+
+    @property
+    def _null(self) -> Array:
+        null = self.unidentified
+        return np.zeros((0, len(self.estimate))) if null is None else null
 
     @functools.cached_property
     def whole(self) -> Model:
@@ -305,9 +309,7 @@ class Fit:
     @property
     def undetermined(self) -> NDArray[np.bool_]:
         """(p,) parameters in directions that nothing determines."""
-        if self.unidentified is None:
-            return np.zeros(len(self.parameters), dtype=np.bool_)
-        return np.asarray(self.unidentified[:, : len(self.parameters)].any(axis=0))
+        return np.asarray(self._null[:, : len(self.parameters)].any(axis=0))
 
     def points(self, name: str, values: ArrayLike, width: int) -> Array:
         """(..., width) commands, or outputs; of a data frame by name."""
@@ -361,15 +363,6 @@ def above_rounding(variance: Array, rows: Array, covariance: Array) -> Array:
     P) may cancel to zero or less: that is not known to be certain."""
     terms = (rows**2 * np.diag(covariance)).sum(axis=-1)
     return np.asarray(np.maximum(variance, np.finfo(np.float64).eps * terms))
-
-
-def _copied(content: Any) -> Any:
-    """A copy of what JSON can hold."""
-    if isinstance(content, str):
-        return content
-    if isinstance(content, Mapping):
-        return {key: _copied(value) for key, value in content.items()}
-    return [*map(_copied, content)] if isinstance(content, list) else content
 
 
 def say_far(

@@ -38,8 +38,8 @@ class _Levels(NamedTuple):
 
 
 def are_shared(problem: FitProblem) -> bool:
-    """Whether few measurements are of parameters that several readings share. Of noise
-    that is of nothing but the readings, and whose levels are not known."""
+    """Whether few measurements are of parameters that several readings share, and their
+    noise is of unknown levels, and of nothing else."""
     model, many = problem.model, not 1 < len(problem.commands) < _FEW
     if problem.noise_known or problem.command_std.any() or model.multiplicity:
         return False

@@ -205,13 +205,11 @@ def _no_noise(fit: Fit) -> Reason | None:
 def _undetermined(fit: Fit) -> Reason | None:
     if not fit.undetermined.any():
         return None
-    names = ", ".join(fit.names[i] for i in np.flatnonzero(fit.undetermined))
-    plateau = ""
-    if not (fit.model.linear or fit.prior_precision.any()):
-        plateau = " The search may have stopped on a plateau."
+    names = ", ".join(np.array(fit.names)[fit.undetermined])
+    searched = not (fit.model.linear or fit.prior_precision.any())
     return Reason(
         f"Not determined, kept near the prior's mean: {names}; see identifiability()."
-        + plateau,
+        + " The search may have stopped on a plateau." * searched,
         "measure rows that determine them: "
         "select(candidates, model=..., measured=commands)",
     )
@@ -232,7 +230,11 @@ def _explains_nothing(fit: Fit) -> Reason | None:
     moved = total > 0.0
     share, names = unexplained[moved] / total[moved], np.array(fit.output_names)[moved]
     more = max(m * fit.num_measurements - dof - m, 1.0)  # parameters but the constants
-    if dof >= 2.0 * m and _apart(fit):
+    apart = fit.affine is not None or m == 1  # each output has parameters of its own
+    if not apart and fit.model.linear:
+        seen = np.asarray(fit.model.jacobian(fit.commands, fit.parameters)).any(axis=0)
+        apart = bool((seen.sum(axis=0) <= 1).all())
+    if dof >= 2.0 * m and apart:
         dof, more = dof / m, more / m
     elif moved.any():
         share, names = share.mean(keepdims=True), np.array([", ".join(names)])
@@ -247,16 +249,6 @@ def _explains_nothing(fit: Fit) -> Reason | None:
         "check that readings and commands belong together (rows, columns, sensor), or "
         "measure over a wider range",
     )
-
-
-def _apart(fit: Fit) -> bool:
-    """Whether every output of a linear model has parameters of its own."""
-    if fit.affine is not None or fit.num_outputs == 1:
-        return True
-    if not fit.model.linear:
-        return False
-    seen = np.asarray(fit.model.jacobian(fit.commands, fit.parameters)).any(axis=0)
-    return bool((seen.sum(axis=0) <= 1).all())
 
 
 def _unknown(fit: Fit) -> Reason | None:

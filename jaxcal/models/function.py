@@ -65,6 +65,7 @@ class FromFunction(Model):
         quiet: no progress on standard error.
     """
 
+    title = "of a function"
     names: tuple[str, ...]
     nominal: Array
 
@@ -200,10 +201,6 @@ class FromFunction(Model):
     def default_noise(self) -> Noise | None:
         """The noise as given."""
         return self._noise
-
-    @property
-    def title(self) -> str:
-        return "of a function"
 
     def to_dict(self) -> dict[str, Any]:
         """The function itself cannot be written."""

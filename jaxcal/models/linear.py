@@ -35,6 +35,7 @@ class Affine(Model):
     """
 
     linear = True
+    title = "y = A u + b"
     num_inputs: int  # n
     num_outputs: int  # m
 
@@ -99,10 +100,6 @@ class Affine(Model):
         """A (m, n) and b (m,)."""
         m, n = self.num_outputs, self.num_inputs
         return parameters[: m * n].reshape(m, n), parameters[m * n :]
-
-    @property
-    def title(self) -> str:
-        return "y = A u + b"
 
     def units_for(self, command_unit: str, measured_unit: str) -> tuple[str, ...]:
         slope = measured_unit

@@ -104,8 +104,6 @@ class Model(abc.ABC):
     def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, n) derivative of the outputs by the commands."""
 
-    # -- names -------------------------------------------------------------------------
-
     @functools.cached_property  # which an attribute may replace
     def num_parameters(self) -> int:
         """p."""
@@ -177,8 +175,6 @@ class Model(abc.ABC):
         """(N, p) derivative of ``log_size``, zero by parameters at which it is held."""
         return np.zeros((len(commands), len(self.names)))
 
-    # -- readings that wrap, and a model that can only be run --------------------------
-
     def wrapped(self, off: Array, commands: Array) -> Array:
         """(N, q) differences of readings, those that wrap within half a period."""
         return within_half(off, self.periods)
@@ -212,8 +208,6 @@ class Model(abc.ABC):
     def distinct(self, commands: Array, measured: Array) -> Rows:
         """(K,) the rows that count; the same contact written twice counts once."""
         return np.arange(len(commands))
-
-    # -- linear models -----------------------------------------------------------------
 
     def centred(self, centre: Array) -> Array | None:
         """(p, p) with ``f(u; theta) = f(u - centre; centred(centre) @ theta)``, or

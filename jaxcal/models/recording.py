@@ -15,25 +15,19 @@ class Recording:
     or poses (geometry_msgs PointStamped, PoseStamped; of a board in the camera too),
     lengths of a wire (sensor_msgs Range, std_msgs Float64), accelerations (sensor_msgs
     Imu), wrenches (WrenchStamped), in metres, radians, newtons; contacts need none.
-
-    Attributes:
-        path: rosbag2 folder or MCAP file (extra ``ros``), or the folder of a LeRobot
-            dataset (extra ``lerobot``), whose joints are in degrees.
-        which: socket, plane or wire of each rest, in order.
-        seconds: shortest rest.
-        within: degrees (or units of length) in which a resting joint stays. When not
-            given 0.05, or eight times what the joint's readings jitter by.
-        servos: LeRobot's calibration file of the arm, if its dataset is in -100 to 100
-            of each motor's range instead of degrees.
-        names: of joints that are recorded under another name: {"Rotation":
-            "shoulder_pan"}.
-        topic: of the readings, if the bag has several of this type.
     """
 
+    # rosbag2 folder or MCAP file (extra ``ros``), or the folder of a LeRobot dataset
+    # (extra ``lerobot``), whose joints are in degrees.
     path: str | os.PathLike[str]
-    which: Sequence[int] | None = None
-    seconds: float = 0.5
+    which: Sequence[int] | None = None  # socket, plane or wire of each rest, in order
+    seconds: float = 0.5  # shortest rest
+    # Degrees (or units of length) in which a resting joint stays. None: 0.05, or eight
+    # times what the joint's readings jitter by.
     within: float | None = None
+    # LeRobot's calibration file of an arm whose dataset is in -100 to 100 of each
+    # motor's range instead of degrees.
     servos: str | os.PathLike[str] | None = None
+    # Of joints recorded under another name: {"Rotation": "shoulder_pan"}.
     names: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    topic: str = ""
+    topic: str = ""  # of the readings, if the bag has several of this type

@@ -42,19 +42,13 @@ class ResolvedPrior:
 class Prior:
     """Independent normal prior of a model's parameters.
 
-    Attributes:
-        std: standard deviation in the parameters' units: one number, (p,), or a mapping
-            from name to number. ``inf`` and names that are left out: nothing is known.
-        mean: one number, (p,), or a mapping from name to number; default the model's
-            nominal values.
-        fixed: names of parameters held at the mean and not identified.
-        by_data: for an arm, the sizes of the errors are estimated; see ``sized``.
+    ``std`` and ``mean`` are one number, (p,), or a mapping from name to number.
     """
 
-    std: PerParameter
-    mean: PerParameter | None = None
-    fixed: Sequence[str] = ()
-    by_data: bool = False
+    std: PerParameter  # in the parameters' units; inf, or left out: nothing is known
+    mean: PerParameter | None = None  # by default, or left out: the nominal values
+    fixed: Sequence[str] = ()  # names of parameters held at the mean, not identified
+    by_data: bool = False  # for an arm, the sizes of the errors are estimated: sized()
 
     def __post_init__(self) -> None:
         if isinstance(self.fixed, str) or not isinstance(self.fixed, Collection):
@@ -106,19 +100,13 @@ def _by_name(
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """Normal noise of the readings, and of the commands.
+    """Normal noise of the readings, and of the commands, in their units."""
 
-    Attributes:
-        std: of the readings, in their units: one number, (q,), or (N, q) for each
-            candidate. 1 where neither it nor ``covariance`` is given.
-        covariance: of the readings instead of std: (q, q) or (N, q, q).
-        command_std: of the commands, in their units: one number, (n,), or (N, n) for
-            each measurement. ``inf``: the command is unknown in every measurement (a
-            nuisance parameter, as the pose of a camera in each view) and is eliminated.
-    """
-
+    # Of the readings: one number, (q,), or (N, q); 1 where none is given.
     std: ArrayLike | None = None
-    covariance: ArrayLike | None = None
+    covariance: ArrayLike | None = None  # instead of std: (q, q) or (N, q, q)
+    # One number, (n,), or (N, n). inf: unknown in every measurement (a nuisance
+    # parameter, as the pose of a camera in each view), and eliminated.
     command_std: ArrayLike | None = None
 
     def __post_init__(self) -> None:
@@ -241,10 +229,11 @@ class Noise:
         skew = np.abs(covariance - np.matrix_transpose(covariance))
         if (skew > 1e-9 * scale).any():
             raise ValueError("covariance of the noise must be symmetric")
-        if covariance.size and np.linalg.eigvalsh(covariance).min() <= 0.0:
+        least = np.linalg.eigvalsh(covariance).min(initial=np.inf)
+        if least <= 0.0:
             raise ValueError(
                 "covariance of the noise must be positive definite, got eigenvalue "
-                f"{np.linalg.eigvalsh(covariance).min():.3g}"
+                f"{least:.3g}"
             )
         return covariance
 

@@ -28,7 +28,7 @@ from jaxcal.calibration.pairing.fit import (
     top,
 )
 from jaxcal.calibration.verdict import froze
-from jaxcal.checks import Array
+from jaxcal.checks import Array, in_words
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Prior
 
@@ -130,21 +130,17 @@ def of_unfitted(
     outputs: Sequence[str],
 ) -> Mispairing | None:
     """How a table was mispaired that could not be fitted, with names of its columns."""
-    counted = np.ones(len(commands), dtype=np.bool_)
-    if not isinstance(prior, Prior | None):  # refused by the fit
-        return None
     with contextlib.suppress(ValueError):
-        prior = prior or model.default_prior()
-        table = _table(model, commands, measured, counted, prior)
-        return _found(table, inputs, outputs, "")
+        if isinstance(prior, Prior | None):  # else refused by the fit
+            table = _table(model, commands, measured, prior or model.default_prior())
+            return _found(table, inputs, outputs, "")
     return None
 
 
 def of_new_readings(fit: Fit, commands: Array, measured: Array) -> Mispairing | None:
     """How readings of a machine that was calibrated before were mispaired."""
     here = Prior(np.inf, mean=np.asarray(fit.estimate))
-    counted = np.ones(len(commands), dtype=np.bool_)
-    table = _table(fit.whole, commands, measured, counted, here, held=True)
+    table = _table(fit.whole, commands, measured, here, held=True)
     if table is None:
         return None
     noise = np.asarray(fit.require_noise("check"))
@@ -159,18 +155,16 @@ def of_fit(fit: Fit) -> Table | None:
     prior = fit.stated_prior or fit.model.default_prior()
     measured = fit.residuals + fit.outputs_at(fit.commands)
     counted = fit.loss_weights > 0.0
-    table = _table(fit.model, fit.commands, measured, counted, prior)
-    if table is None:
-        return None
-    return dataclasses.replace(table, theta=np.asarray(fit.parameters))
+    table = _table(fit.model, fit.commands, measured, prior, counted)
+    return table and dataclasses.replace(table, theta=np.asarray(fit.parameters))
 
 
 def _table(
     model: Model,
     commands: Array,
     measured: Array,
-    counted: Any,
     prior: Prior,
+    counted: Any = None,
     held: bool = False,
 ) -> Table | None:
     """The table, linearised at the prior's mean, or all parameters held there; None
@@ -178,9 +172,8 @@ def _table(
     resolved = prior.resolve(model)
     free = resolved.free & (not held)
     most = _RUNS if model.resolution else _ROWS
-    if len(commands) > most:
-        commands, measured = commands[:most], measured[:most]
-        counted = counted[:most]
+    commands, measured = commands[:most], measured[:most]
+    counted = np.ones(len(commands), np.bool_) if counted is None else counted[:most]
     flat = bool((resolved.precisions == 0.0).all() and free.all())
     shared = model.multiplicity > 0 and flat
     # A measurement that is written twice counts once.
@@ -221,7 +214,7 @@ def _found(
         return None
     # Loaded, here and below, only where a table is in doubt.
     from jaxcal.calibration.pairing.rearranged import changed_columns, polished
-    from jaxcal.calibration.pairing.words import sentence, what_is_wrong
+    from jaxcal.calibration.pairing.search import what_is_wrong
 
     fits = [fit for fit in _alternatives(table, plain) if not _few(fit)]
     if not any(_explains(plain, fit) for fit in fits):
@@ -253,8 +246,12 @@ def _found(
         shifts = [fit for fit in rivals if fit.hypothesis.kind in _FREQUENT]
         if shifts:
             rivals[rivals.index(shifts[0])], best = best, shifts[0]
-    reason = sentence(table, best, near, outputs, unit)
-    named = [what_is_wrong(table, fit, {}, outputs, unit) for fit in rivals]
+    noise = f"{in_words(best.noise * table.scale)} {unit}".strip()
+    joined = best.hypothesis.extra is not None
+    without = "with each apart" if joined else "without that"
+    reason = what_is_wrong(table, best, near, unit)
+    reason += f"; {without} the noise is {noise}"
+    named = [what_is_wrong(table, fit, {}, unit) for fit in rivals]
     others = [*dict.fromkeys(x for x in named if x not in reason)][:_NAMED]
     match = best.hypothesis.match
     if best.hypothesis.kind == _APART:

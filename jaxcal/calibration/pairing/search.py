@@ -1,5 +1,8 @@
-"""Pairings of rows that are tried, and ranked by least squares: those of a change at
-any row follow from sums of normal equations over the rows before and after."""
+"""Pairings of rows that are tried, ranked by least squares, and what they are called.
+
+Those of a change at any row follow from sums of normal equations over the rows before
+and after.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from numpy.typing import NDArray
 from jaxcal.calibration.pairing.fit import (
     AS_IT_IS,
     FOREIGN,
+    Fitted,
     Hypothesis,
     Path,
     Rows,
@@ -23,7 +27,7 @@ from jaxcal.calibration.pairing.fit import (
     shifted,
     solved,
 )
-from jaxcal.checks import Array
+from jaxcal.checks import Array, in_words
 
 _SHIFTS = (0, 1, -1, 2, -2, 3, -3)
 _EDGES = 128  # rows at which a change is tried first, and of models of many parameters:
@@ -32,6 +36,11 @@ _MANY = 20  # parameters
 _LEAST = 3  # rows that a change leaves on either side
 _KINDS = np.log(10.0)
 _LAGS = 200  # rows, of a recording
+_WHOLE = {
+    "reversed": "the readings are in reverse order",
+    "commands sorted": "the commands are sorted and the readings are not",
+    "readings sorted": "the readings are sorted and the commands are not",
+}
 
 
 class _Sums(NamedTuple):
@@ -294,3 +303,68 @@ def _with_columns(systems: _Systems, slopes: Array, right: Array, more: Array) -
     ones = np.ones(len(more))
     totals, count = ones[:, None] * (aim**2).sum(axis=0), ones * table.counted.sum()
     return systems.evidence(_Sums(squares, products, totals, 0.0 * ones, count), e)
+
+
+def what_is_wrong(
+    table: Table, fit: Fitted, near: dict[int, list[int]], unit: str
+) -> str:
+    """The mispairing as a sentence; rows are counted from 0."""
+    hypothesis, count = fit.hypothesis, len(table.commands)
+    kind, starts = hypothesis.kind, hypothesis.starts
+    if hypothesis.change is not None:
+        return hypothesis.change.words
+    if kind == "shift":
+        return f"all readings are {_rows_late(starts[0][1])}"
+    if kind in _WHOLE:
+        return _WHOLE[kind]
+    if kind == "halves":
+        return (
+            "the halves of the readings are exchanged: the readings from row "
+            f"{-starts[0][1] % count} on belong to the first commands"
+        )
+    if kind == "rotation":
+        last, far = "first" if starts[0][1] > 0 else "last", abs(starts[0][1])
+        these = f"{last} {far} are" if far > 1 else f"{last} is"
+        return (
+            f"all readings are {_rows_late(starts[0][1])}; the {these} at the other end"
+        )
+    if kind in ("offset", "parameters"):
+        another = "slope or offset"
+        if kind == "offset":
+            steps = (
+                fit.solution[-1] if table.shared else fit.solution[-table.outputs :, 0]
+            )
+            size = f"{in_words(steps * table.scale)} {unit}".strip()
+            another = f"offset, by {size}"
+        return (
+            f"the table seems to join two sessions: from row {starts[1][0]} on the "
+            f"readings have another {another}"
+        )
+    return _path_words(starts, near, count)
+
+
+def _rows_late(by: int) -> str:
+    rows = "one row" if abs(by) == 1 else f"{abs(by)} rows"
+    late, where = ("early", "below") if by > 0 else ("late", "above")
+    return f"{rows} {late} (each belongs to the command {rows} {where})"
+
+
+def _path_words(path: Path, near: dict[int, list[int]], count: int) -> str:
+    parts = []
+    for i, (start, by) in enumerate(path):
+        if by == 0:
+            continue
+        end = path[i + 1][0] if i + 1 < len(path) else count
+        where = (
+            f"from row {start} on" if end == count else f"from row {start} to {end - 1}"
+        )
+        if start == 0:
+            where = f"up to row {end - 1}"
+        rows = near.get(i, [])
+        if len(rows) > 1:
+            where += f" (or any from {rows[0]} to {rows[-1]})"
+        if by == FOREIGN:
+            parts.append(f"{where}, readings do not belong to these commands")
+        else:
+            parts.append(f"{where}, readings are {_rows_late(by)}")
+    return "; ".join(parts)
