@@ -144,10 +144,10 @@ def apart(rows: Array) -> list[NDArray[np.intp]]:
     np.fill_diagonal(joined, True)
     if joined.all():
         return [np.arange(rows.shape[1])]
-    while (more := joined.astype(np.float64) @ joined > 0.0).sum() > joined.sum():
-        joined = more
-    first = joined.argmax(axis=1)  # column of the group of each
-    return [np.flatnonzero(first == column) for column in dict.fromkeys(first)]
+    from scipy.sparse import csgraph
+
+    count, group = csgraph.connected_components(joined)
+    return [np.flatnonzero(group == k) for k in range(count)]
 
 
 def singular(rows: Array) -> list[tuple[NDArray[np.intp], Array, Array]]:
