@@ -166,12 +166,13 @@ def _of_all_rows(
             matches.append(shifted(count, by))
             names.append(("shift", code, ((0, by),)))
     half = count // 2
-    near = (1, 2, 3, count - 3, count - 2, count - 1) if fast else ()
-    for by in {half, count - half, *near}:
+    turns = range(1, count) if fast and count <= _EDGES else {half, count - half}
+    for by in turns:  # a lag, whose first or last rows are at the other end
         halves = by in (half, count - half)
-        code = _KINDS + np.log(2.0 if halves else 6.0)
+        near = min(by, count - by) <= 3
+        code = _KINDS + np.log(2.0 if halves else 6.0 if near else count)
         matches.append((rows + by) % count)
-        kind = "halves" if halves and half > 3 else "rotation"
+        kind = "halves" if halves and not near else "rotation"
         names.append((kind, code, ((0, by if by < half else by - count),)))
     return np.array(matches), names
 
@@ -322,11 +323,16 @@ def what_is_wrong(
             "the halves of the readings are exchanged: the readings from row "
             f"{-starts[0][1] % count} on belong to the first commands"
         )
-    if kind == "rotation":
+    if kind == "rotation" and abs(starts[0][1]) <= count // 3:
         last, far = "first" if starts[0][1] > 0 else "last", abs(starts[0][1])
         these = f"{last} {far} are" if far > 1 else f"{last} is"
         return (
             f"all readings are {_rows_late(starts[0][1])}; the {these} at the other end"
+        )
+    if kind == "rotation":
+        return (
+            f"the readings from row {-starts[0][1] % count} on belong to the first "
+            "commands, the readings before it to the last"
         )
     if kind in ("offset", "parameters"):
         another = "slope or offset"
