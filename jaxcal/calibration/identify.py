@@ -95,7 +95,8 @@ def identify(
             residuals contradict it (F test, 0.1 %), and one for all where
             ``command_std`` is given. Where fewer than 30 measurements have outputs that
             share parameters, as trajectories, one for all, one that varies smoothly
-            along them, or one for each, as the residuals show and the summary says.
+            along them, or one for each run or each, as the residuals show and the
+            summary says.
         loss: "gaussian" is least squares, the default of an affine model without prior;
             "student" (4 degrees of freedom, of a measurement as a whole), otherwise the
             default, gives outliers little weight.

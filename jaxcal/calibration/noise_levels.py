@@ -2,14 +2,15 @@
 
 A level for each of many readings, as of a trajectory, cannot be told from few
 measurements: their weights would be noise themselves. So one level, one that varies
-smoothly along the readings and one for each reading are compared by Schwarz's
-criterion; more than one is taken where the evidence is strong (Kass and Raftery, 1995).
+smoothly along the readings, one for each of a few groups and one for each reading are
+compared by Schwarz's criterion; more than one is taken where the evidence is strong
+(Kass and Raftery, 1995).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,10 @@ from jaxcal.models.predictions import derivative
 _FEW = 30  # measurements from which on a level of its own costs a reading nothing
 _STRONG = 6.0  # of Schwarz's criterion, for more than one level
 _DEGREES = 8  # at most, of a level that varies smoothly
+_TURNS = (2, 3, 4, 5, 6)  # readings taken in turn
 _ROUNDS = 4
 _SAME = 0.02  # of the logarithm of a profile, which would not change in another round
+_LEAST = 10.0  # degrees of freedom of a run of readings
 _ONE = "one level for all {} readings of a measurement"
 _OWN = "one level for each of the {} readings"
 
@@ -148,11 +151,47 @@ def _best(square: Array, freedom: Array) -> _Levels:
 
     one = _Levels(_ONE.format(q), none, None, 1)
     others = [_Levels(_OWN.format(q), np.arange(q), None, q)]
+    for turn in _TURNS:
+        if q % turn == 0 and q > turn:
+            says = f"one level for each of {turn} readings in turn"
+            others.append(_Levels(says, np.arange(q) % turn, None, turn))
+    if q >= 4:
+        others.append(_blocks(square, freedom, seen))
     if q >= 2 * _DEGREES:
         shapes = (_smooth(square, freedom, seen, k + 1) for k in range(_DEGREES))
         others += [shape for shape in shapes if shape is not None]
     best = min(others, key=evidence)
     return best if evidence(best) + _STRONG < evidence(one) else one
+
+
+def _blocks(square: Array, freedom: Array, seen: NDArray[np.bool_]) -> _Levels:
+    """Readings one after another that share a level, halved while that gains."""
+    q, price = len(square), 2.0 * np.log(freedom.sum())
+    squares = np.append(0.0, np.where(seen, square, 0.0).cumsum())
+    freedoms = np.append(0.0, np.where(seen, freedom, 0.0).cumsum())
+
+    def fit(first: Any, last: Any) -> Array:
+        total = np.maximum(freedoms[last] - freedoms[first], 1e-300)
+        mean = np.maximum((squares[last] - squares[first]) / total, 1e-300)
+        return np.asarray(total * np.log(mean))
+
+    open_parts, ends = [(0, q)], [0, q]
+    while open_parts:
+        first, last = open_parts.pop()
+        cuts = np.arange(first + 1, last)
+        left, right = freedoms[cuts] - freedoms[first], freedoms[last] - freedoms[cuts]
+        cuts = cuts[np.minimum(left, right) >= _LEAST]
+        if not cuts.size:
+            continue
+        gains = fit(first, last) - fit(first, cuts) - fit(cuts, last)
+        cut = int(cuts[gains.argmax()])
+        if gains.max() > price:
+            ends.append(cut)
+            open_parts += [(first, cut), (cut, last)]
+    groups = np.searchsorted(np.sort(ends)[1:-1], np.arange(q), side="right")
+    count = len(ends) - 1
+    says = f"one level for each of {count} runs of readings"
+    return _Levels(says, groups.astype(np.intp), None, 2 * count - 1)
 
 
 def _smooth(

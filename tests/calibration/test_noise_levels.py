@@ -73,6 +73,16 @@ def test_a_level_that_varies_along_time_is_found(rng: np.random.Generator) -> No
     np.testing.assert_allclose(found.noise_std, level, rtol=0.4)
 
 
+def test_runs_of_readings_in_other_units_have_levels_of_their_own(
+    rng: np.random.Generator,
+) -> None:
+    model = Decay(80)
+    level = np.where(np.arange(80) < 30, 0.001, 0.2)
+    found = jaxcal.identify(*session(model, 3, level, rng), model=model)
+    assert "2 runs" in found.summary()
+    np.testing.assert_allclose(found.noise_std, level, rtol=0.4)
+
+
 def test_groups_that_are_declared_share_a_level(rng: np.random.Generator) -> None:
     model, groups = Decay(40), ["slow"] * 15 + ["fast"] * 25
     table = session(model, 3, 0.1, rng)
