@@ -18,7 +18,7 @@ from jaxcal.calibration.fit_problem import (
     singular,
 )
 from jaxcal.calibration.least_squares import FitSolution, solve
-from jaxcal.calibration.noise_levels import are_shared, levels_differ, pooled
+from jaxcal.calibration.noise_levels import are_shared, pooled, with_levels_apart
 from jaxcal.calibration.prior_scales import (
     PriorScales,
     covariance_of_scales,
@@ -112,7 +112,7 @@ def fit_model(
     else:
         solution = solve(problem)
     if common_noise is None and model.default_noise() is not None:
-        solution = _with_levels_apart(solution)
+        solution = with_levels_apart(solution)
     fields = _fields(solution, observations, centre)
     by_noise = fields["joint_covariance"]
     if by_noise is not None:  # count what was estimated besides: scales and misfit
@@ -213,17 +213,6 @@ def _solve_with_misfit(
         free=resolved.free,
     )
     return *_solve_with_scales(problem), factor
-
-
-def _with_levels_apart(solution: FitSolution) -> FitSolution:
-    """The fit with a level of noise for each output where the residuals ask for it."""
-    if levels_differ(solution):
-        levels = np.arange(len(solution.problem.levels))
-        apart = dataclasses.replace(solution.problem, levels=levels)
-        other = solve(apart, solution)
-        if other.freedom.min() >= 1.0:
-            return other
-    return solution
 
 
 def _solve_with_scales(problem: FitProblem) -> tuple[FitSolution, PriorScales]:

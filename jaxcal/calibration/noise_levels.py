@@ -75,13 +75,14 @@ def pooled(problem: FitProblem) -> tuple[FitSolution, str]:
     return solution, levels.says
 
 
-def levels_differ(solution: FitSolution) -> bool:
-    """Whether levels that are shared contradict the residuals (F test, 0.1 %), without
-    what facts explain: a wrong distance of two sockets is no noise along it."""
+def with_levels_apart(solution: FitSolution) -> FitSolution:
+    """The fit with a level for each output where residuals contradict shared ones (F
+    test, 0.1 %), without what facts explain: a wrong distance of two sockets is no
+    noise along it."""
     q, problem = len(solution.freedom), solution.problem
     stated = problem.noise_known or problem.command_std.any()
     if stated or q == 1 or solution.freedom.min() < 1.0:
-        return False
+        return solution
     from scipy import special
 
     white = solution.white / solution.level - _by_facts(solution)
@@ -89,7 +90,10 @@ def levels_differ(solution: FitSolution) -> bool:
     high, low = int(variance.argmax()), int(variance.argmin())
     ratio = variance[high] / max(variance[low], np.finfo(np.float64).tiny)
     chance = special.fdtrc(solution.freedom[high], solution.freedom[low], ratio)
-    return bool(chance * q * (q - 1) < 1e-3)
+    if chance * q * (q - 1) >= 1e-3:
+        return solution
+    other = solve(dataclasses.replace(problem, levels=np.arange(q)), solution)
+    return other if other.freedom.min() >= 1.0 else solution
 
 
 def _by_facts(solution: FitSolution) -> Array:
