@@ -65,10 +65,10 @@ def rank_rule(
     unit = columns / np.maximum(lengths, _TINY)[:, None]
     if not lengths.all():  # what is rounding is no column
         unit *= (lengths > 0.0)[:, None]
-    if num_rows < p:
-        distances = np.zeros((len(columns), p))
-    else:
-        distances = _distances(unit)
+    distances = np.zeros((len(columns), p))  # of each column to the span before it
+    if num_rows >= p:  # their product is the volume: cheaper than singular values
+        factor: Array = np.linalg.qr(unit, mode="raw")[0]
+        distances = np.abs(factor.diagonal(axis1=1, axis2=2))
     value = 2.0 * np.log(np.maximum(distances * lengths, _TINY)).sum(axis=1)
     unsure = distances.min(axis=1) <= SURE * rounding
     for n in np.flatnonzero(unsure) if unsure.any() else ():
@@ -77,13 +77,6 @@ def rank_rule(
         if ranks[n] < p:
             value[n] = -np.inf
     return ranks, value
-
-
-def _distances(columns: Array) -> Array:
-    """(S, p) of each column of (S, R, p) to the span of those before it, R >= p. Their
-    product is the volume: cheaper than the singular values."""
-    factor: Array = np.linalg.qr(columns, mode="raw")[0]
-    return np.abs(factor.diagonal(axis1=1, axis2=2))
 
 
 def null_directions(
