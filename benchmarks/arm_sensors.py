@@ -40,6 +40,7 @@ from scipy import optimize, stats
 from scipy.spatial.transform import Rotation
 
 import jaxcal
+from jaxcal.arms.written import for_file
 from jaxcal.models import (
     Board,
     Distance,
@@ -509,7 +510,7 @@ def files(draws: int) -> None:
             plain: Any = found.model.writable()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
-                written = found._for_file()[np.isin(found.names, plain.names)]
+                written = for_file(found)[np.isin(found.names, plain.names)]
                 again = found.again(plain, plain.default_prior())
             low, high = np.clip(plain.limits, -180.0, 180.0).T
             anywhere = np.random.default_rng(0).uniform(low, high, (500, len(low)))

@@ -32,17 +32,17 @@ def to_urdf(fit: Calibration, path: Path, *, force: bool = False) -> str:
     agrees best) and gear harmonics (the rest is fitted again); a warning says by how
     much they differ.
     """
-    return str(_written("urdf", fit, path, force))
+    return str(_arm(fit).write("urdf", path, for_file(fit), force=force))
 
 
 def to_dh(fit: Calibration, path: Path, *, force: bool = False) -> None:
     """Write the DH table as CSV, corrected as ``to_urdf`` says."""
-    _written("dh", fit, path, force)
+    _arm(fit).write("dh", path, for_file(fit), force=force)
 
 
 def to_ur_kinematics(fit: Calibration, path: Path, *, force: bool = False) -> None:
     """Write Universal Robots' kinematics file, corrected as ``to_urdf`` says."""
-    _written("ur", fit, path, force)
+    _arm(fit).write("ur", path, for_file(fit), force=force)
 
 
 def to_lerobot(
@@ -93,13 +93,13 @@ def _arm(fit: Calibration) -> Any:
     return fit.model
 
 
-def _written(form: str, fit: Calibration, path: Path, force: bool) -> Any:
-    """Write what the form can hold; a warning gives the effect of what it cannot."""
+def for_file(fit: Calibration) -> Array:
+    """(p,) for a file: without what no file holds; a warning gives the effect."""
     model, parameters = _arm(fit), np.array(fit.parameters)
     plain, unit = model.writable(), f" {fit.measured_unit}".rstrip()
     held = np.isin(fit.names, plain.names)
     if held.all() and not fit.estimate[len(fit.names) :].any():
-        return model.write(form, path, parameters, force=force)
+        return parameters
     errors = ""
     if held.all():
         change = "it was fitted without harmonics"
@@ -125,4 +125,4 @@ def _written(form: str, fit: Calibration, path: Path, force: bool) -> Any:
         f"{np.linalg.norm(off, axis=1).mean():.3g}{unit} on average{errors}",
         stacklevel=3,
     )
-    return model.write(form, path, parameters, force=force)
+    return parameters
