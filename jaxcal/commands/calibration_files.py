@@ -25,37 +25,25 @@ class ReportOptions:
     """The page of a calibration, and what it is compared with."""
 
     TITLE: ClassVar[str] = "the page of a calibration"
-    RARE: ClassVar[Any] = {"against", "certificate"}
+    RARE: ClassVar[Any] = {"against"}
 
     report: ReportFolder = ""
     against: Annotated[
         str | None, "earlier calibration.json to compare with on the page", "FILE"
     ] = None
-    certificate: Annotated[
-        float | None,
-        "expanded uncertainty (k = 2) in the reference instrument's certificate, in "
-        "the measured unit, for the budget on the page",
-        "U",
-    ] = None
 
     def require(self) -> None:
         """Refuse options of a page without a page."""
-        if not self.report and self != ReportOptions():
-            raise ValueError("--against and --certificate need --report FOLDER")
+        if self.against and not self.report:
+            raise ValueError("--against needs --report FOLDER")
 
     def written(self, calibration: Calibration, files: Sequence[str | None]) -> bool:
         """Write the page, if it was asked for; whether nothing on it is bad."""
         if not self.report:
             return True
-        sources = []
-        if self.certificate is not None:
-            from jaxcal.reports.budget import Source
-
-            sources = [Source.certificate("certificate", self.certificate)]
         return calibration.report(
             self.report,
             before=Calibration.load(self.against) if self.against else None,
-            sources=sources,
             files=[path for path in files if path and os.path.isfile(path)],
         )
 

@@ -53,10 +53,6 @@ def identify(
     of_arm: ArmOptions,
     recording: RecordingOptions,
     noise: Annotated[Numbers, "std of a measurement, if known", "S"] = None,
-    play: Annotated[
-        float | None, "backlash of an arm's joints in degrees: hobby servos 0.3"
-    ] = None,
-    weights: Annotated[str | None, "column of relative weights", "W"] = None,
     command_unit: Annotated[str, "unit of the commands", "UNIT"] = "",
     measured_unit: Annotated[str, "unit of the readings", "UNIT"] = "",
     accuracy: Annotated[
@@ -83,24 +79,19 @@ def identify(
         raise ValueError(f"--repair must name another file than {file}")
     saved.require(file, of_urdf, recording.servos)
     page.require()
-    if saved.repair and weights:
-        raise ValueError("--repair writes no weights: leave out --repair or --weights")
     table = recording.table(file, lambda which: of_arm.of_recording(model, which))
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
     if accuracy is not None and not is_arm(machine):
         raise ValueError("--accuracy needs an arm: --model FILE.urdf")
-    readings = _readings(
-        of_arm, machine, table, inputs, outputs, weights, of_urdf=of_urdf
-    )
+    readings = _readings(of_arm, machine, table, inputs, outputs, of_urdf=of_urdf)
     if of_urdf and machine.sensor.lengths:  # files of this format are in metres
         measured_unit = measured_unit or "m"
     calibration = identified(
         readings.commands,
         readings.measured,
         model=machine,
-        **_noise(machine, noise, play),
-        weights=table.columns([weights])[:, 0] if weights else None,
+        noise_std=noise[0] if noise and len(noise) == 1 else noise,
         input_names=readings.inputs,
         output_names=readings.outputs,
         command_unit=command_unit,
@@ -119,19 +110,6 @@ def identify(
     if page.report:
         print(f"report {os.path.join(page.report, 'index.html')}")
     return int(not good)
-
-
-def _noise(machine: Any, stds: list[float] | None, play: float | None) -> Any:
-    """``noise`` and ``noise_std`` of ``identify``, by --noise and --play."""
-    std = stds[0] if stds and len(stds) == 1 else stds
-    if play is None:
-        return {"noise": None, "noise_std": std}
-    if not is_arm(machine):
-        raise ValueError("--play needs an arm: --model FILE.urdf")
-    noise = machine.noise_with_play(play)
-    if std is not None:
-        noise = dataclasses.replace(noise, std=std)
-    return {"noise": noise, "noise_std": None}
 
 
 def _repaired(
@@ -173,7 +151,6 @@ def _readings(
     table: Table,
     inputs: str | None,
     outputs: str | None,
-    weights: str | None,
     *,
     of_urdf: bool,
 ) -> _Readings:
@@ -187,7 +164,7 @@ def _readings(
     columns = machine.sensor.outputs if of_urdf else table.outputs(outputs)
     if of_urdf and not contacts:
         columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
-    names = of_arm.columns(machine, table, inputs, (*columns, weights or ""))
+    names = of_arm.columns(machine, table, inputs, columns)
     commands = of_arm.commands(machine, table, names)
     if contacts:
         measured = np.zeros((len(table), len(columns)))

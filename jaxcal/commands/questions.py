@@ -14,20 +14,16 @@ from jaxcal.arguments import Numbers, Was, levels, several
 from jaxcal.commands.arms import ArmOptions, ModelPath
 from jaxcal.commands.tables import Output, TablePath
 from jaxcal.information.singular import require_excited
-from jaxcal.models import Affine
-from jaxcal.selection import Design, Selection, Worst
+from jaxcal.selection import Design, Selection
 from jaxcal.selection.criteria import CRITERIA, offered
 from jaxcal.tables import Table, read_table
 
 Names = Annotated[list[str] | None, several(str, "names")]
-Rows = Annotated[list[int] | None, several(int, "whole numbers")]
 
 
 @dataclasses.dataclass
 class DesignOptions:
     """The problem that a table of candidates and these options describe."""
-
-    RARE: ClassVar[Any] = {"num_outputs", "scenarios"}
 
     inputs: Annotated[
         str | None,
@@ -36,30 +32,16 @@ class DesignOptions:
         Was("columns"),
     ] = None
     model: ModelPath = None
-    num_outputs: Annotated[
-        int | None,
-        "outputs of y = A u + b; default as many as commands",
-        "M",
-        Was("outputs"),
-    ] = None
     noise: Annotated[
         Numbers, "standard deviation of a measurement: one, or one per output", "S"
     ] = None
     replicates: Annotated[int, (1,), "how often a row may be measured", "R"] = 1
-    required: Annotated[Rows, "rows that must be chosen, counted from 0", "I,J"] = None
-    scenarios: Annotated[
-        int | None, "average over this many random draws of the model's parameters", "N"
-    ] = None
 
     def design(self, table: Table, of_arm: ArmOptions) -> Design:
         """The design of the candidates in a table."""
         model, mask = of_arm.machine(self.model, table), table.available()
         names = of_arm.columns(model, table, self.inputs)
         candidates = of_arm.commands(model, table, names, mask)
-        if self.num_outputs is not None:
-            if model is not None:
-                raise ValueError("--num-outputs is set by --model: leave it out")
-            model = Affine(len(names), self.num_outputs)
         if self.model is None:  # said here in the names of the columns
             used = candidates if mask is None else candidates[mask]
             distinct = f"rows ({len(np.unique(used, axis=0))} of them distinct)"
@@ -70,9 +52,7 @@ class DesignOptions:
             model,
             noise=None if self.noise is None else _one_or_all(self.noise),
             available=mask,
-            required=self.required,
             max_replicates=self.replicates,
-            scenarios=self.scenarios,
             names=table.row_names,
         )
         design.candidate_set.axes = names
@@ -89,7 +69,7 @@ def _of_parameters(word: str) -> str:
 class CriterionOptions:
     """The criterion."""
 
-    RARE: ClassVar[Any] = {"parameters", "worst"}
+    RARE: ClassVar[Any] = {"parameters"}
 
     criterion: Annotated[
         str | None, "default D for affine models, else I", offered()
@@ -97,12 +77,9 @@ class CriterionOptions:
     parameters: Annotated[
         Names, f"parameters of interest, with {_of_parameters('and')}", "A,B"
     ] = None
-    worst: Annotated[bool, "with --scenarios: by the worst, not the mean"] = False
 
-    def by(self, scenarios: int | None) -> Any:
-        """The criterion, over so many scenarios."""
-        if self.worst and scenarios is None:
-            raise ValueError("--worst needs --scenarios N")
+    def named(self) -> Any:
+        """The criterion as ``Design`` takes it."""
         name, parameters = self.criterion, self.parameters
         kind = None if name is None else CRITERIA[name]
         if (kind is not None and kind.of_parameters) != (parameters is not None):
@@ -111,10 +88,9 @@ class CriterionOptions:
                 if parameters is None
                 else f"--parameters goes with --criterion {_of_parameters('or')} only"
             )
-        criterion: Any = name
-        if kind is not None and parameters is not None:
-            criterion = kind(parameters)  # type: ignore[call-arg]  # of_parameters
-        return Worst(criterion) if self.worst else criterion
+        if kind is None or parameters is None:
+            return name
+        return kind(parameters)  # type: ignore[call-arg]  # of_parameters
 
 
 @dataclasses.dataclass
@@ -125,26 +101,15 @@ class MethodOptions:
     RARE: ClassVar[bool] = True
 
     seed: Annotated[int | None, "seed of random methods; default 0", "S"] = None
-    restarts: Annotated[int | None, "random starts of the exchange"] = None
-    time_limit: Annotated[
-        float | None, "for auto, exact and the optimum; default 10", "SECONDS"
-    ] = None
-    best: Annotated[int | None, "with exact: prove the B best selections", "B"] = None
-    least_efficiency: Annotated[
-        float | None, "auto stops when this efficiency is proven; default 0.999"
-    ] = None
+    time_limit: Annotated[float | None, "for auto and exact; default 10", "SECONDS"] = (
+        None
+    )
     checkpoint: Annotated[str | None, "with policy: a trained policy", "DIR"] = None
-    decoding: Annotated[str | None, "policy: greedy, first, samples, exchange"] = None
-    num: Annotated[
-        int | None, "samples of the decodings first and samples; default 16"
-    ] = None
 
 
 @dataclasses.dataclass
 class ScoreOptions:
     """A selection made elsewhere, to be scored."""
-
-    RARE: ClassVar[Any] = {"reference"}
 
     score: Annotated[
         str | None,
@@ -153,20 +118,9 @@ class ScoreOptions:
         Was("indices"),
         Was("subset"),
     ] = None
-    reference: Annotated[
-        Literal["bound", "exact"],
-        "compare --score with a bound, or with the proven optimum",
-    ] = "bound"
 
-    def judged(
-        self, design: Design, table: Table, criterion: Any, options: dict[str, Any]
-    ) -> Selection:
-        """The choice, judged; ``options`` are those of methods that were given."""
-        if "time_limit" in options and self.reference != "exact":
-            raise ValueError("--time-limit needs --reference exact")
-        if others := sorted({*options} - {"time_limit"}):
-            flags = ", ".join(f"--{name.replace('_', '-')}" for name in others)
-            raise ValueError(f"Leave out with --score: {flags}")
+    def judged(self, design: Design, table: Table, criterion: Any) -> Selection:
+        """The choice, judged."""
         given = self.score or ""
         if re.fullmatch(r"\s*\d+\s*(,\s*\d+\s*)*", given):
             rows = np.array([int(row) for row in given.split(",")])
@@ -177,7 +131,7 @@ class ScoreOptions:
                 "--score must be rows counted from 0, such as 0,4,7, or a table "
                 f"written by --csv; {given!r} is neither: no such file"
             )
-        return design.score(rows, criterion, reference=self.reference, **options)
+        return design.score(rows, criterion)
 
 
 def select(
@@ -195,9 +149,6 @@ def select(
         "auto (the cheapest proof), exact, exchange, greedy, random, policy",
         "NAME",
     ] = "auto",
-    between: Annotated[
-        bool, "then refine the chosen rows between the candidates, within their range"
-    ] = False,
     of_criterion: CriterionOptions,
     of_score: ScoreOptions,
     of_method: MethodOptions,
@@ -211,25 +162,16 @@ def select(
     table = read_table(file)
     options = {name: x for name, x in vars(of_method).items() if x is not None}
     design = of_design.design(table, of_arm)
-    criterion = of_criterion.by(of_design.scenarios)
-    if of_score.score is not None:
-        if k is not None or method != "auto" or between:
-            raise ValueError("Leave out -k, --method and --between with --score")
-        _show(of_score.judged(design, table, criterion, options), table, output)
-        return
-    selection = design.select(k, criterion, method, **options)
-    if not between:
-        _show(selection, table, output)
-        return
-    if of_arm.kind != "position":
-        raise ValueError(
-            "--between needs a sensor that reads everywhere, not --sensor "
-            f"{of_arm.kind}. In Python: design.refine(..., allowed=arm.reachable())"
-        )
-    refined = design.refine(selection, criterion=criterion)
-    names = list(design.axes or ())
-    if not output.written(names, refined.commands.tolist(), refined.to_dict()):
-        print(refined)
+    criterion = of_criterion.named()
+    if of_score.score is None:
+        selection = design.select(k, criterion, method, **options)
+    else:
+        if others := [f"--{name.replace('_', '-')}" for name in sorted(options)]:
+            raise ValueError(f"Leave out with --score: {', '.join(others)}")
+        if k is not None or method != "auto":
+            raise ValueError("Leave out -k and --method with --score")
+        selection = of_score.judged(design, table, criterion)
+    _show(selection, table, output)
 
 
 def plan(
@@ -247,15 +189,13 @@ def plan(
         Literal["G", "I"],
         "G: largest standard error over the candidates; I: mean",
     ] = "G",
-    max_k: Annotated[int | None, "largest number of measurements tried", "K"] = None,
-    more: Annotated[int, "rows of the table beyond the answer"] = 0,
     output: Output,
 ) -> None:
     """Find the number of measurements that a wanted accuracy needs."""
     if of_design.noise is None:
         raise ValueError("--noise is missing: the standard deviation of a measurement")
     result = of_design.design(read_table(file), of_arm).plan(
-        _one_or_all(accuracy), criterion=criterion, max_k=max_k, more=more
+        _one_or_all(accuracy), criterion=criterion
     )
     header = ("k", "distinct", "standard_error", "least_error")
     rows = [

@@ -13,6 +13,7 @@ import pytest
 import jaxcal
 from jaxcal.calibration.verdict import left_out
 from jaxcal.commands import main
+from jaxcal.reports.budget import Source
 from jaxcal.reports.calibration import SCHEMA, leverage, moved
 
 
@@ -47,7 +48,7 @@ def test_a_pipeline_reads_the_verdict_and_the_exit_code(tmp_path, rng, capsys):
     u, y = table(data, rng)
     saved = str(tmp_path / "c.json")
     asked = ["identify", str(data), "--out", saved, "--report", str(folder)]
-    assert main([*asked, "--certificate", "0.02"]) == 0
+    assert main(asked) == 0
     found = json.loads((folder / "verdict.json").read_text())
     assert found["good"] and found["exit_code"] == 0 and found["of"] == "identify"
     assert found["files"][str(data)] == hashlib.sha256(data.read_bytes()).hexdigest()
@@ -56,6 +57,9 @@ def test_a_pipeline_reads_the_verdict_and_the_exit_code(tmp_path, rng, capsys):
     again = jaxcal.Calibration.load(folder / "calibration.json")
     wanted = jaxcal.Calibration.load(saved)
     assert again.parameters.tolist() == wanted.parameters.tolist()
+    again.report(folder, sources=[Source.certificate("certificate", 0.02)],
+                 at=[[10.0, -2.0, 3.0]])  # fmt: skip
+    found = json.loads((folder / "verdict.json").read_text())
     assert [s["name"] for s in found["budget"]["sources"]] == ["noise", "certificate"]
     z = np.column_stack([u, np.ones(len(u))])
     off = y - z @ np.linalg.lstsq(z, y)[0]
