@@ -17,28 +17,14 @@ _MARKED = re.compile(r"[+-]?\d*(?:[.,]\d+)+(?:[eE][+-]?\d+)?")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")  # or three decimals
 _MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "nat", "<na>"}
 _TRUTHS = {"true": 1.0, "yes": 1.0, "false": 0.0, "no": 0.0, "1": 1.0, "0": 0.0}
-_WITH_UNIT = re.compile(r"[+-]?\d*[.,]?\d+[.,]?(?:[eE][+-]?\d+)?\s*(?P<unit>[^\s\d].*)")
 UNIT = re.compile(
     r"[\[(].*[\])]|[-%°‰]|(?:[/.·*^ ²³0-9-]|[pnuµμmckMGh]?(?:deg|rad|m|s|g|V|A|W|N|Hz"
     r"|Pa|bar|Ω|l|L|C|F|K|J|rpm|min|h|psi|in|inch|°C|°F|°|%|ct|cts|counts?|steps?|pulses?"
     r"|degrees?|radians?|volts?|sec|seconds?|T|S|Ohm|ppm|dB|lx|px|LSB|mmHg|RH|rev"
     r"|arcsec|arcmin|a\.u\.|ε))+"
 )
-_FORTRAN = re.compile(r"[+-]?\d*\.?\d+\.?[dD][+-]?\d+")
 _LEAST = 100.0  # a whole number beside 14.036 that makes that one doubtful
 _OTHER = {".": ",", ",": "."}
-
-
-class Ambiguity(ValueError):
-    """A cell that could be two numbers, and its place in the column."""
-
-    def __init__(self, cells: Sequence[str], place: int) -> None:
-        self.place, cell = place, cells[place]
-        plain = cell.replace(",", "").replace(".", "")
-        super().__init__(
-            f"{cell!r} may mean {plain} or a number with three decimals: write "
-            f"{plain}, or a fourth decimal"
-        )
 
 
 def truths_of(cells: Iterable[str], words: Sequence[str] = ()) -> list[float] | None:
@@ -52,19 +38,6 @@ def is_number(cell: str) -> bool:
     """Whether a cell is a number in whatever way it is written."""
     cell = _plain(cell)
     return _float(cell) is not None or _MARKED.fullmatch(cell) is not None
-
-
-def has_unit(cells: Sequence[str]) -> bool:
-    """Whether all cells are numbers with their unit, 12.5 mm or 7%, or fractions."""
-    parts = [_WITH_UNIT.fullmatch(_plain(cell)) for cell in cells if cell]
-    if None in parts or len(parts) < 2:
-        return False
-    units = {part["unit"] for part in parts if part}
-    if any(unit[0] == "/" for unit in units):
-        return all(unit[1:].isdecimal() for unit in units)
-    unit = units.pop()
-    sure = len(unit) > 1 or unit in "%°" or not {*".,"}.isdisjoint("".join(cells))
-    return not units and sure and UNIT.fullmatch(unit) is not None
 
 
 def decimal_mark(cells: Sequence[str], semicolons: bool) -> tuple[str, bool]:
@@ -94,23 +67,25 @@ def _vote(cell: str) -> str | None:
     return None if _THOUSANDS.fullmatch(cell) else last
 
 
-def numbers_of(
-    cells: Sequence[str], mark: str = ".", decided: bool = True
-) -> list[float | None]:
+def numbers_of(cells: Sequence[str], mark: str = ".") -> list[float | None]:
     """Each cell as a number, NaN where it is empty, None where it holds none."""
-    numbers = [_number(cell, mark) for cell in cells]
+    return [_number(cell, mark) for cell in cells]
+
+
+def ambiguous(cells: Sequence[str], mark: str, decided: bool) -> int | None:
+    """The place of the first cell that could be two numbers."""
     marked = [i for i, cell in enumerate(cells) if cell[-4:-3] in (".", ",")]
     doubtful = [i for i in marked if _THOUSANDS.fullmatch(_plain(cells[i]))]
     if grouped := [i for i in doubtful if mark not in cells[i] and not decided]:
-        raise Ambiguity(cells, grouped[0])
+        return grouped[0]
     if decimals := [i for i in doubtful if mark in cells[i]]:
         rest = [_plain(cells[i]) for i in {*range(len(cells))} - {*doubtful}]
         rest = [cell for cell in rest if cell.casefold() not in _MISSING]
         if all(cell.lstrip("+-").isdecimal() for cell in rest):
             largest = max((abs(float(cell)) for cell in rest), default=0.0)
             if _LEAST <= largest < 1000.0:
-                raise Ambiguity(cells, decimals[0])
-    return numbers
+                return decimals[0]
+    return None
 
 
 def _plain(cell: str) -> str:
@@ -136,8 +111,6 @@ def _number(cell: str, mark: str) -> float | None:
 
 
 def _float(cell: str) -> float | None:
-    if _FORTRAN.fullmatch(cell):
-        cell = cell.lower().replace("d", "e")
     try:
         return None if "_" in cell else float(cell)
     except ValueError:

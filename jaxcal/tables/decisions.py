@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxcal.checks import Array
-from jaxcal.tables.cells import has_unit, truths_of
+from jaxcal.tables.cells import truths_of
 
 COMMANDS, MEASURED = "u_", "y_"  # how the names of columns begin
 _LOG = logging.getLogger("jaxcal")
@@ -39,12 +39,8 @@ _TIMES = {"time", "uhrzeit", "elapsed", "clock"}
 # T alone is a temperature.
 _SECONDS = re.compile(r"t|[tT][ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?")
 _MARKS = "holds 0 and 1; if it says which rows may be chosen, name it available"
-COUNTED = "it looks like a row number or a time"
+COUNTED = "like a row number or a time"
 _LIKE_U, _LIKE_Y = re.compile(r"[uU]\d*|U_.*"), re.compile(r"[yY]\d*|Y_.*")
-_PLURALS = {  # of a reason's begin
-    "it looks": "they look", "it holds": "they hold", "it is": "they are",
-    "rises": "they rise", "holds": "they hold", "a factor: it does": "they do",
-}  # fmt: skip
 _EPOCH = 1e8  # seconds; no factor of an experiment is so large
 
 
@@ -71,7 +67,8 @@ def decide(
         elif name.startswith(COMMANDS):
             decision = Decision("input")
         elif name in table.labels:
-            decision = _of_words(table.labels[name])
+            truths = truths_of(table.labels[name], ("true", "false"))
+            decision = Decision("label", "words" if truths is None else "TRUE, FALSE")
         else:
             column = table.values[:, table.names.index(name)]
             decision = _of_numbers(name, column, table.header, marked, outputs, fit)
@@ -79,18 +76,9 @@ def decide(
     if not of_role("input", decisions):
         for name in of_role("time", decisions):  # a course over time, say
             if not _is_stamp(name):
-                decisions[name] = Decision("input", "it is the only one")
+                decisions[name] = Decision("input", "the only one")
                 break
     return decisions if marked else decisions | _counting(table, decisions)
-
-
-def _of_words(cells: Sequence[str]) -> Decision:
-    if has_unit(cells):
-        cell = next(filter(None, cells))
-        return Decision("label", f"holds numbers and units, {cell!r}", asks=True)
-    truths = truths_of(cells, ("true", "false"))
-    words = "words" if truths is None else "TRUE and FALSE"
-    return Decision("label", f"it holds {words}")
 
 
 def is_available(name: str) -> bool:
@@ -111,7 +99,7 @@ def _of_numbers(
     if name.startswith(MEASURED):
         return _of_y(name, header, bool(marked), outputs, fit)
     if not len(numbers):
-        return Decision("left out", "it is empty")
+        return Decision("left out", "empty")
     if timed := _of_time(name, numbers):
         if timed.role == "time" or not marked:
             return timed
@@ -165,7 +153,7 @@ def _of_time(name: str, numbers: Array) -> Decision | None:
     rising = len(numbers) > 1 and bool((np.diff(numbers) > 0.0).all())
     if stamp or rising or numbers.min() > _EPOCH:
         return Decision("time", COUNTED)
-    return Decision("input", "a factor: it does not rise from row to row")
+    return Decision("input", "a factor: no rise from row to row")
 
 
 def _counting(table: Any, decisions: dict[str, Decision]) -> dict[str, Decision]:
@@ -230,13 +218,8 @@ def of_role(role: str, decisions: Mapping[str, Decision]) -> tuple[str, ...]:
 
 def listed(names: Sequence[str], what: str) -> str:
     """Columns and what they are, as part of a sentence."""
-    quoted = ", ".join(map(repr, names))
-    if not names[1:]:
-        return f"column {quoted} is {what}"
-    what = re.sub(r"^(read as \w+)", r"\1s", what)
-    for one, several in _PLURALS.items():
-        what = what.replace(f": {one} ", f": {several} ")
-    return f"columns {quoted} are {what}"
+    begin = "columns {} are" if len(names) > 1 else "column {} is"
+    return f"{begin.format(', '.join(map(repr, names)))} {what}"
 
 
 def say(text: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import gzip
 import io
 import math
@@ -72,14 +71,10 @@ def parse(source: str, data: bytes) -> Table:
 
 def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
     """The table in a text, and what is to be said of how it was read."""
-    sheet = sheet_of(source, text)
-    rows, notes = sheet.rows, [*sheet.notes]
+    rows, delimiter, headed, notes = sheet_of(source, text)
     _, header = rows[0]
-    mark = decimal_mark(
-        [cell for _, row in rows for cell in row], sheet.delimiter != ","
-    )
-    if not sheet.headed:
-        _require_decimals(source, sheet)
+    mark = decimal_mark([cell for _, row in rows for cell in row], delimiter != ",")
+    if not headed:
         header = [f"u_{axis_letter(i, len(header))}" for i in range(len(header))]
     elif numbers := [cell for cell in header if _is_plain(cell)]:
         name = next(cell for cell in header if not _is_plain(cell))
@@ -99,25 +94,10 @@ def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
         elif any(cells):
             notes += _unnamed(source, place, cells, columns)
     lines = tuple(line for line, _ in rows)
-    table = table_of(source, columns, lines, mark, headed=sheet.headed)
+    table = table_of(source, columns, lines, mark, headed=headed)
     if not table.names:
         raise ValueError(f"{source}: no column contains numbers: {', '.join(header)}")
     return table, notes
-
-
-def _require_decimals(source: str, sheet: Sheet) -> None:
-    """Refuse numbers that decimal commas have cut into two cells each: -0,79."""
-    width = len(sheet.rows[0][1])
-    if sheet.delimiter != "," or width % 2:
-        return
-    cells = [cell for _, row in sheet.rows for cell in row]
-    whole = all(cell.lstrip("+-").isdecimal() for cell in cells)
-    for line, row in sheet.rows if whole else ():
-        if any(cell in ("-0", "+0") or re.match(r"0\d", cell) for cell in row):
-            raise ValueError(
-                f"{source}: line {line} may hold {width // 2} numbers with decimal "
-                f"commas, or {width} whole ones: separate cells with semicolons"
-            )
 
 
 def _is_plain(cell: str) -> bool:
@@ -134,16 +114,6 @@ def _unnamed(
     if len({*cells}) == len(cells) and all(cell.isdecimal() for cell in cells):
         return [f"ignored column {place} (looks like a row number)"]
     raise ValueError(f"{source}: column {place} has no name")
-
-
-@dataclasses.dataclass(frozen=True)
-class Sheet:
-    """Cells of a table as it was written."""
-
-    rows: list[tuple[int, list[str]]]  # line and cells, as many in each row
-    delimiter: str
-    headed: bool  # the first row holds names
-    notes: tuple[str, ...]  # how it was read, where that is not the plain way
 
 
 def decoded(source: str, data: bytes) -> tuple[str, str]:
@@ -171,8 +141,11 @@ def decoded(source: str, data: bytes) -> tuple[str, str]:
     return text, note
 
 
-def sheet_of(source: str, text: str) -> Sheet:
-    """Rows of a text, its comments and its row of units left out."""
+def sheet_of(
+    source: str, text: str
+) -> tuple[list[tuple[int, list[str]]], str, bool, list[str]]:
+    """Rows of a text, line and as many cells each, its comments and its row of units
+    left out; the delimiter; whether the first row holds names; what is to be said."""
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     notes: list[str] = []
     stated = re.fullmatch(r"\"?sep=(.)\"?", lines[0].strip())
@@ -196,7 +169,7 @@ def sheet_of(source: str, text: str) -> Sheet:
         units = ", ".join(filter(None, rows[1][1]))
         notes.append(f"units are taken from line {rows[1][0]}: {units}")
         del rows[1]
-    return Sheet(rows, delimiter, headed, tuple(notes))
+    return rows, delimiter, headed, notes
 
 
 def _without_comments(

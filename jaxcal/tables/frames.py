@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -115,35 +116,23 @@ def of_frame(
 ) -> Any:
     """The ``wanted`` columns (..., n) of a frame, or of rows, by name; else as given.
 
-    Args:
-        used: (N,) rows whose numbers must be finite; all when not given.
-        levels: of each column the words that are read as 0, 1, ...; () of numbers.
-
-    Raises:
-        ValueError: a name is missing, or could be either of two; a cell is no number.
+    ``used`` (N,) and ``levels`` as of ``Table.columns``, whose errors it raises.
     """
     frame = _collected(frame)
     names = names_in(argument, frame, wanted, prefix)
     if names is None:
         return frame
-    block: Any = None
-    plain = hasattr(frame, "columns") and not hasattr(frame, "column_names")
-    if plain and hasattr(frame, "__getitem__"):
-        block = frame[[*names]]
-    if block is None or np.asarray(block).dtype.kind not in "iuf":
-        columns = [
-            _numbers(argument, name, _column(frame, name), words)
-            for name, words in zip(names, levels or [()] * len(names), strict=True)
-        ]
-        block = np.stack(columns, axis=-1)
-    bad = ~np.isfinite(np.asarray(block))
-    for place in np.argwhere(bad if used is None else bad & np.c_[used])[:1]:
-        where = f"row {place[0]}, " if len(place) > 1 else ""
-        raise ValueError(
-            f"{argument}: {where}column {names[place[-1]]!r} must be finite, got "
-            f"{np.asarray(block)[*place]}"
-        )
-    return block
+    columns = [_column(frame, name) for name in names]
+    shape = np.shape(columns[0])
+    cells = [_cells(np.ravel(column)) for column in columns]
+    named = dict(zip(names, cells, strict=True))
+    table = table_of(argument, named, range(math.prod(shape)), None, row="row")
+    used = None if used is None else np.asarray(used)
+    values = table.columns(names, used, levels).reshape(*shape, len(names))
+    if any(isinstance(column, list) for column in cells):
+        return values
+    kind = np.concatenate([column[:0] for column in cells]).dtype
+    return values.astype(kind)  # float32 is rounded, which ``select`` must know
 
 
 def say_order(commands: Any, measured: Any) -> None:
@@ -162,25 +151,9 @@ def say_order(commands: Any, measured: Any) -> None:
 
 
 def _collected(frame: Any) -> Any:
-    """A lazy frame read, and a series of structs as a frame."""
+    """A lazy frame read."""
     lazy = hasattr(frame, "collect") and not hasattr(frame, "to_numpy")
-    frame = frame.collect() if lazy else frame
-    structs = getattr(getattr(frame, "struct", None), "fields", ())  # of polars
-    return frame.struct.unnest() if structs else frame
-
-
-def _numbers(argument: str, name: str, values: Any, levels: Sequence[str] = ()) -> Any:
-    array = np.asarray(values)
-    if array.dtype.kind == "b":
-        return array.astype(np.float64)
-    if not isinstance(cells := _cells(values), list):
-        return array
-    table = table_of(argument, {name: cells}, range(len(cells)), None, row="row")
-    numbers = table.values
-    if table.labels:  # an empty cell of words is refused where its row is used
-        used = np.zeros(len(table), np.bool_) if levels else None
-        numbers = table.columns([name], used, [levels])
-    return numbers.reshape(array.shape)
+    return frame.collect() if lazy else frame
 
 
 def names_in(
@@ -194,7 +167,6 @@ def names_in(
     these and ``beside`` are said."""
     header = header_of(argument, frame)
     if not header:
-        _require_no_rows_of(argument, frame, wanted, prefix)
         return None
     try:
         names = columns_by_name(wanted, header, prefix)
@@ -210,21 +182,6 @@ def names_in(
         if spare:
             say(f"{argument}: {spare}")
     return tuple(names)
-
-
-def _require_no_rows_of(
-    argument: str, frame: Any, wanted: Sequence[str], prefix: str
-) -> None:
-    """Refuse a frame, or an array of xarray, whose rows have the columns' names."""
-    rows: Any = getattr(frame, "index", ())
-    if _is_labelled(frame):
-        axis = frame.coords.get(frame.dims[0]) if frame.ndim > 1 else None
-        rows = () if axis is None else axis.values.tolist()
-    rows = [] if callable(rows) else [row for row in rows if isinstance(row, str)]
-    if rows and None not in columns_by_name(wanted, rows, prefix):
-        raise ValueError(
-            f"{argument}: {', '.join(rows)} are names of rows; transpose it (.T)"
-        )
 
 
 def table_of_frame(argument: str, frame: Any) -> Table:

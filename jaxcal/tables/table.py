@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxcal.checks import Array, Mask
-from jaxcal.tables.cells import Ambiguity, decimal_mark, numbers_of, truths_of
+from jaxcal.tables.cells import ambiguous, decimal_mark, numbers_of, truths_of
 from jaxcal.tables.decisions import (
     AVAILABLE,
     COMMANDS,
@@ -187,15 +187,9 @@ class Table:
         decisions = decide(self, {*but}, fit=bool(but))
         advice = f"begin the names of commands with {COMMANDS}"
         advice += f", or name them with {option}" if option else ""
-        or_choose = f", or choose the commands with {option}" if option else ""
         for place, (name, decision) in enumerate(decisions.items(), start=1):
             if not decision.asks or decision.role == "output":
                 continue
-            if decision.role == "label":
-                raise ValueError(
-                    f"{self.source}: column {name!r} {decision.reason}: write the "
-                    f"number alone in each cell{or_choose}"
-                )
             if self.row != "line":
                 decisions[name] = Decision("input", decision.reason)
                 continue
@@ -318,11 +312,16 @@ def table_of(
         if isinstance(cells, np.ndarray):
             numeric[name] = cells
             continue
-        try:
-            numbers = numbers_of(cells, *(mark or decimal_mark(cells, True)))
-        except Ambiguity as error:
-            where = f"{source}: {row} {lines[error.place]}, column {name!r}"
-            raise ValueError(f"{where}: {error}") from None
+        point, decided = mark or decimal_mark(cells, True)
+        numbers = numbers_of(cells, point)
+        if (place := ambiguous(cells, point, decided)) is not None:
+            cell = cells[place]
+            plain = cell.replace(",", "").replace(".", "")
+            raise ValueError(
+                f"{source}: {row} {lines[place]}, column {name!r}: {cell!r} may mean "
+                f"{plain} or a number with three decimals: write {plain}, or a fourth "
+                "decimal"
+            )
         must = name.startswith(COMMANDS) or (marked and name.startswith(MEASURED))
         truths = truths_of(cells, ("true", "false")) if must else None
         count = sum(number is None for number in numbers)
