@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -17,17 +17,168 @@ from jaxcal.commands.arms import (
     ArmOptions,
     ModelPath,
     RecordingOptions,
+    in_degrees,
     is_recording,
-)
-from jaxcal.commands.calibration_files import (
-    ReportFolder,
-    ReportOptions,
-    SavedFiles,
-    commands_for,
-    is_arm,
 )
 from jaxcal.commands.tables import Output, write_json, write_rows
 from jaxcal.tables import COMMANDS, MEASURED, Table, read_table
+
+ReportFolder = Annotated[
+    str,
+    "write a page, verdict.json and the calibration into this folder; exit code 1 if "
+    "the calibration is not good",
+    "FOLDER",
+]
+
+
+@dataclasses.dataclass
+class SavedFiles:
+    """What an identification is saved as."""
+
+    RARE: ClassVar[Any] = {"overwrite", "unproven", "repair", "servos_out"}
+
+    out: Annotated[
+        str,
+        "save the calibration (.json) or an arm's corrected file (.urdf)",
+        "FILE",
+    ] = ""
+    overwrite: Annotated[
+        bool, "overwrite an existing .urdf, servos or --repair file"
+    ] = False
+    unproven: Annotated[bool, "write the .urdf even if the calibration is not good"] = (
+        False
+    )
+    repair: Annotated[
+        str, "if rows are mispaired, write the corrected table", "FILE"
+    ] = ""
+    servos_out: Annotated[
+        str, "write LeRobot's calibration file: --servos with corrected zeros", "FILE"
+    ] = ""
+
+    transform: Annotated[
+        str,
+        "--sensor board: write the camera's pose for the uncorrected arm, as a "
+        "TransformStamped (.yaml), ROS 2's static_transform_publisher (.sh, or .py to "
+        "launch it), or the .urdf with the camera's link",
+        "FILE",
+    ] = ""
+    frames: Annotated[
+        str | None,
+        "with --transform: the camera's parent link and the name of its optical frame",
+        "PARENT,CHILD",
+    ] = None
+
+    @property
+    def as_urdf(self) -> bool:
+        """The arm's own file is written, corrected."""
+        return self.out.lower().endswith(".urdf")
+
+    @property
+    def corrected(self) -> str:
+        """The file that a robot would go by, if one was asked for."""
+        return (self.out if self.as_urdf else self.servos_out) or self.transform
+
+    def require(self, file: str, of_urdf: bool, servos: str | None) -> None:
+        """Refuse files that cannot be written, or must not be, before the fit."""
+        if self.servos_out and self.as_urdf:
+            raise ValueError(
+                "Leave out --servos-out or --out FILE.urdf: each corrects the zeros, "
+                "so both would correct them twice"
+            )
+        files = "--out FILE.urdf, --servos-out and --transform"
+        for option in ("unproven", "overwrite"):
+            of_table = self.repair and option == "overwrite"
+            if getattr(self, option) and not (self.corrected or of_table):
+                more = " or --repair" * (option == "overwrite")
+                raise ValueError(f"--{option} needs {files}{more}")
+        if self.frames is not None and not self.transform:
+            raise ValueError("--frames needs --transform FILE")
+        if len((self.frames or "a,b").split(",")) != 2:
+            raise ValueError(f"--frames takes PARENT,CHILD, got {self.frames}")
+        if self.transform and not of_urdf:
+            raise ValueError("--transform needs --model FILE.urdf and --sensor board")
+        if self.servos_out and not servos:
+            raise ValueError("--servos-out needs --servos FILE")
+        if servos and not (self.servos_out or is_recording(file)):
+            raise ValueError("--servos needs a recording or --servos-out")
+        if self.as_urdf and not of_urdf:
+            raise ValueError("--out FILE.urdf needs --model FILE.urdf")
+        for path in (self.transform, self.out if self.as_urdf else "", self.repair):
+            if path and os.path.exists(path) and not self.overwrite:
+                raise ValueError(f"{path} exists; pass --overwrite to replace it")
+
+    def written(self, calibration: Calibration, servos: str | None) -> list[str]:
+        """Write the files that were asked for; a line of each."""
+        corrected = self.corrected
+        if corrected and not calibration.verdict.good and not self.unproven:
+            raise ValueError(
+                f"{corrected} was not written: the calibration is not good (reasons "
+                "above). --unproven writes it anyway"
+            )
+        lines = []
+        if self.as_urdf:
+            tip = calibration.to_urdf(self.out, force=self.overwrite)
+            lines = [f"saved {self.out}, tip link {tip}"]
+        elif self.out:
+            calibration.save(self.out)
+            lines = [f"saved {self.out}"]
+        if self.transform:
+            parent, child = (self.frames or ",").split(",")
+            arm: Any = calibration.model
+            count = len(arm.sensor.members)
+            for camera in range(count):
+                stem, ending = os.path.splitext(self.transform)
+                number = f"_{camera}" if count > 1 else ""
+                pose = calibration.to_transform(
+                    f"{stem}{number}{ending}",
+                    child=child.strip() + number * bool(child.strip()) or None,
+                    parent=parent.strip() or None,
+                    camera=camera,
+                    force=self.overwrite,
+                )
+                lines.append(f"saved {stem}{number}{ending}: {pose}")
+        if self.servos_out:
+            steps = calibration.to_lerobot(
+                self.servos_out, str(servos), force=self.overwrite
+            )
+            moved = ", ".join(f"{name} {step:+d}" for name, step in steps.items())
+            lines.append(f"saved {self.servos_out}, steps: {moved}")
+        return lines
+
+
+def commands_for(
+    calibration: Calibration,
+    table: Table,
+    chosen: str | None = None,
+    option: str = "--inputs",
+    *,
+    radians: bool = False,
+) -> tuple[tuple[str, ...], Array]:
+    """The columns of the commands of a calibration in a table, and (N, n) they hold.
+
+    ``radians``: of an arm, whose commands are then made degrees.
+    """
+    model: Any = calibration.model
+    if radians and not is_arm(model):
+        raise ValueError("--radians needs an arm")
+    names = table.named(
+        calibration.input_names,
+        COMMANDS,
+        chosen=chosen,
+        option=option,
+        unit=calibration.command_unit,
+        others=calibration.output_names,
+    )
+    commands = table.columns(names, None, getattr(model, "levels", ()))
+    return names, in_degrees(model, commands) if radians else commands
+
+
+def is_arm(model: Any) -> bool:
+    """Whether a model is an arm, of which some options are."""
+    from jaxcal.arms import SerialChain
+
+    return isinstance(model, SerialChain)
+
 
 RecordPath = Annotated[
     str, "CSV, or - (standard input); for an arm also a bag or a LeRobot dataset"
@@ -49,7 +200,10 @@ def identify(
     outputs: Annotated[str | None, "columns of measurements", "C,D"] = None,
     model: ModelPath = None,
     saved: SavedFiles,
-    page: ReportOptions,
+    report: ReportFolder = "",
+    against: Annotated[
+        str | None, "earlier calibration.json to compare with on the page", "FILE"
+    ] = None,
     of_arm: ArmOptions,
     recording: RecordingOptions,
     noise: Annotated[Numbers, "std of a measurement, if known", "S"] = None,
@@ -78,22 +232,25 @@ def identify(
     if saved.repair and os.path.realpath(saved.repair) == os.path.realpath(file):
         raise ValueError(f"--repair must name another file than {file}")
     saved.require(file, of_urdf, recording.servos)
-    page.require()
+    if against and not report:
+        raise ValueError("--against needs --report FOLDER")
     table = recording.table(file, lambda which: of_arm.of_recording(model, which))
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
     if accuracy is not None and not is_arm(machine):
         raise ValueError("--accuracy needs an arm: --model FILE.urdf")
-    readings = _readings(of_arm, machine, table, inputs, outputs, of_urdf=of_urdf)
+    commands, measured, names, columns = _readings(
+        of_arm, machine, table, inputs, outputs, of_urdf=of_urdf
+    )
     if of_urdf and machine.sensor.lengths:  # files of this format are in metres
         measured_unit = measured_unit or "m"
     calibration = identified(
-        readings.commands,
-        readings.measured,
+        commands,
+        measured,
         model=machine,
         noise_std=noise[0] if noise and len(noise) == 1 else noise,
-        input_names=readings.inputs,
-        output_names=readings.outputs,
+        input_names=names,
+        output_names=columns,
         command_unit=command_unit,
         measured_unit=measured_unit,
         accuracy=accuracy,
@@ -101,14 +258,18 @@ def identify(
     )
     lines = saved.written(calibration, recording.servos)
     if saved.repair:
-        lines.append(_repaired(saved.repair, file, calibration, table, readings))
-    good = page.written(calibration, (file, model))
+        lines.append(_repaired(saved.repair, file, calibration, table, names, columns))
+    good = not report or calibration.report(
+        report,
+        before=Calibration.load(against) if against else None,
+        files=[path for path in (file, model) if path and os.path.isfile(path)],
+    )
     if json:
         write_json("", calibration.to_dict())
         return int(not good)
     print("\n".join([calibration.summary(), *lines]))
-    if page.report:
-        print(f"report {os.path.join(page.report, 'index.html')}")
+    if report:
+        print(f"report {os.path.join(report, 'index.html')}")
     return int(not good)
 
 
@@ -117,16 +278,17 @@ def _repaired(
     file: str,
     calibration: Calibration,
     table: Table,
-    readings: _Readings,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
 ) -> str:
     """Write the rows of a mispaired table that belong together; a line that says so."""
     mispairing = calibration.mispairing
     if mispairing is None:
         raise ValueError(f"{path} was not written: {file} has no mispaired rows")
-    names, measured = [*readings.inputs], np.zeros((len(table), 0))
-    if {*readings.outputs} <= {*table.names}:
-        names, measured = [*names, *readings.outputs], table.columns(readings.outputs)
-    columns = mispairing.repaired(table.columns(readings.inputs), measured)
+    names, measured = [*inputs], np.zeros((len(table), 0))
+    if {*outputs} <= {*table.names}:
+        names, measured = [*names, *outputs], table.columns(outputs)
+    columns = mispairing.repaired(table.columns(inputs), measured)
     rows, match = np.hstack(columns).tolist(), mispairing.match
     for name, cells in table.labels.items():  # words stand beside their command
         names.append(name)
@@ -134,15 +296,6 @@ def _repaired(
             row.append(cells[of])
     write_rows(path, names, rows)
     return f"saved {path}, {len(columns[0])} of {len(table)} rows; {file} is unchanged"
-
-
-class _Readings(NamedTuple):
-    """Commands (N, n) and readings (N, m), and the names of their columns."""
-
-    commands: Array
-    measured: Array
-    inputs: Sequence[str]
-    outputs: Sequence[str]
 
 
 def _readings(
@@ -153,8 +306,8 @@ def _readings(
     outputs: str | None,
     *,
     of_urdf: bool,
-) -> _Readings:
-    """The columns that begin with u_ and y_, or those that were named.
+) -> tuple[Array, Array, Sequence[str], Sequence[str]]:
+    """Commands (N, n), readings (N, m) and their columns: u_ and y_, or those named.
 
     ``of_urdf``: those named as the arm's joints and its sensor's; contacts have none.
     """
@@ -172,7 +325,7 @@ def _readings(
         raise ValueError(f"--inputs and --outputs both hold {both[0]}")
     else:
         measured = table.columns(columns)
-    return _Readings(commands, measured, names, columns)
+    return commands, measured, names, columns
 
 
 CalibrationPath = Annotated[str, "made by identify", "calibration.json"]

@@ -111,9 +111,9 @@ def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
         "cores": str(os.cpu_count()),
         "jaxcal": _version("jaxcal", "a checkout that is not installed"),
     }
-    lines = importlib.metadata.requires("jaxcal") or []
-    for package in dict.fromkeys(re.split(r"[^\w.-]", line)[0] for line in lines):
-        if package != "jaxcal":
+    for line in importlib.metadata.requires("jaxcal") or []:
+        package = re.split(r"[^\w.-]", line)[0]
+        if package != "jaxcal" and not re.search("extra == .(bench|dev|docs)", line):
             versions[package] = _version(package, "not installed")
     versions["devices"] = _devices()
     cache = "JAX_COMPILATION_CACHE_DIR"

@@ -65,32 +65,18 @@ def _of_parameters(word: str) -> str:
     return f" {word} ".join(letters)
 
 
-@dataclasses.dataclass
-class CriterionOptions:
-    """The criterion."""
-
-    RARE: ClassVar[Any] = {"parameters"}
-
-    criterion: Annotated[
-        str | None, "default D for affine models, else I", offered()
-    ] = None
-    parameters: Annotated[
-        Names, f"parameters of interest, with {_of_parameters('and')}", "A,B"
-    ] = None
-
-    def named(self) -> Any:
-        """The criterion as ``Design`` takes it."""
-        name, parameters = self.criterion, self.parameters
-        kind = None if name is None else CRITERIA[name]
-        if (kind is not None and kind.of_parameters) != (parameters is not None):
-            raise ValueError(
-                f"--criterion {name} needs --parameters NAME,..."
-                if parameters is None
-                else f"--parameters goes with --criterion {_of_parameters('or')} only"
-            )
-        if kind is None or parameters is None:
-            return name
-        return kind(parameters)  # type: ignore[call-arg]  # of_parameters
+def _criterion(name: str | None, parameters: list[str] | None) -> Any:
+    """The criterion as ``Design`` takes it."""
+    kind = None if name is None else CRITERIA[name]
+    if (kind is not None and kind.of_parameters) != (parameters is not None):
+        raise ValueError(
+            f"--criterion {name} needs --parameters NAME,..."
+            if parameters is None
+            else f"--parameters goes with --criterion {_of_parameters('or')} only"
+        )
+    if kind is None or parameters is None:
+        return name
+    return kind(parameters)  # type: ignore[call-arg]  # of_parameters
 
 
 @dataclasses.dataclass
@@ -107,31 +93,16 @@ class MethodOptions:
     checkpoint: Annotated[str | None, "with policy: a trained policy", "DIR"] = None
 
 
-@dataclasses.dataclass
-class ScoreOptions:
-    """A selection made elsewhere, to be scored."""
-
-    score: Annotated[
-        str | None,
-        "score this selection: rows counted from 0, or a table written by --csv",
-        "ROWS|FILE",
-        Was("indices"),
-        Was("subset"),
-    ] = None
-
-    def judged(self, design: Design, table: Table, criterion: Any) -> Selection:
-        """The choice, judged."""
-        given = self.score or ""
-        if re.fullmatch(r"\s*\d+\s*(,\s*\d+\s*)*", given):
-            rows = np.array([int(row) for row in given.split(",")])
-        elif given == "-" or os.path.exists(given):
-            rows = _rows_of(read_table(given), table)
-        else:
-            raise ValueError(
-                "--score must be rows counted from 0, such as 0,4,7, or a table "
-                f"written by --csv; {given!r} is neither: no such file"
-            )
-        return design.score(rows, criterion)
+def _scored(given: str, table: Table) -> NDArray[np.int64]:
+    """(k,) rows of a selection made elsewhere."""
+    if re.fullmatch(r"\s*\d+\s*(,\s*\d+\s*)*", given):
+        return np.array([int(row) for row in given.split(",")])
+    if given == "-" or os.path.exists(given):
+        return _rows_of(read_table(given), table)
+    raise ValueError(
+        "--score must be rows counted from 0, such as 0,4,7, or a table "
+        f"written by --csv; {given!r} is neither: no such file"
+    )
 
 
 def select(
@@ -149,8 +120,19 @@ def select(
         "auto (the cheapest proof), exact, exchange, greedy, random, policy",
         "NAME",
     ] = "auto",
-    of_criterion: CriterionOptions,
-    of_score: ScoreOptions,
+    criterion: Annotated[
+        str | None, "default D for affine models, else I", offered()
+    ] = None,
+    parameters: Annotated[
+        Names, f"parameters of interest, with {_of_parameters('and')}", "A,B"
+    ] = None,
+    score: Annotated[
+        str | None,
+        "score this selection: rows counted from 0, or a table written by --csv",
+        "ROWS|FILE",
+        Was("indices"),
+        Was("subset"),
+    ] = None,
     of_method: MethodOptions,
     output: Output,
 ) -> None:
@@ -162,15 +144,15 @@ def select(
     table = read_table(file)
     options = {name: x for name, x in vars(of_method).items() if x is not None}
     design = of_design.design(table, of_arm)
-    criterion = of_criterion.named()
-    if of_score.score is None:
-        selection = design.select(k, criterion, method, **options)
+    wanted = _criterion(criterion, parameters)
+    if score is None:
+        selection = design.select(k, wanted, method, **options)
     else:
         if others := [f"--{name.replace('_', '-')}" for name in sorted(options)]:
             raise ValueError(f"Leave out with --score: {', '.join(others)}")
         if k is not None or method != "auto":
             raise ValueError("Leave out -k and --method with --score")
-        selection = of_score.judged(design, table, criterion)
+        selection = design.score(_scored(score, table), wanted)
     _show(selection, table, output)
 
 
