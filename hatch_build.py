@@ -109,7 +109,6 @@ def _zig() -> list[str]:
 
 
 def _link() -> list[str]:
-    """Flags of a module that Python loads."""
     if WINDOWS:  # all symbols must be known
         libraries = pathlib.Path(sys.base_prefix) / "libs"
         version = sysconfig.get_config_var("py_version_nodot")
@@ -127,16 +126,13 @@ def _run(command: list[object]) -> None:
         raise SystemExit(f"failed: {shlex.join(words)}\n{done.stdout}{done.stderr}")
 
 
-def kernels() -> list[pathlib.Path]:
-    """The sources, relative to the checkout."""
-    return [
-        path.relative_to(ROOT) for path in sorted(ROOT.glob("jaxcal/**/*kernel.py"))
-    ]
-
-
 def build() -> list[pathlib.Path]:
     """Compile what is older than its source; all modules, relative to the checkout."""
-    return _Build()()
+    sources = sorted(ROOT.glob("jaxcal/**/*kernel.py"))
+    compile_one = _Build().module
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        kernels = [path.relative_to(ROOT) for path in sources]
+        return list(pool.map(compile_one, [None, *kernels]))
 
 
 class _Build:
@@ -162,13 +158,7 @@ class _Build:
         common = [ROOT / "hatch_build.py", *ROOT.glob("jaxcal/**/*.pxd")]
         self.changed = max(path.stat().st_mtime for path in common)
 
-    def __call__(self) -> list[pathlib.Path]:
-        """Compile what is older than its source; all modules."""
-        sources = [None, *kernels()]
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            return list(pool.map(self._module, sources))
-
-    def _module(self, source: pathlib.Path | None) -> pathlib.Path:
+    def module(self, source: pathlib.Path | None) -> pathlib.Path:
         """The module of a kernel; with None, of what all of them share."""
         plain = source.with_suffix("") if source else pathlib.Path(*SHARED.split("."))
         target = plain.with_name(plain.name + sysconfig.get_config_var("EXT_SUFFIX"))
