@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import sys
 import time
 from typing import Annotated, Literal
@@ -16,8 +15,6 @@ from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.options import FILE, DeviceOptions, Path, Step
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
-Angles = tuple[float, float, float]
-CIRCLE = (-360, 360)
 
 
 def setup(
@@ -41,7 +38,6 @@ def setup(
 ) -> int:
     """from cables to a device that may be calibrated; writes rig.toml"""
     from rig.journal.device import DeviceRecord
-    from rig.journal.run_folder import new_run_folder
     from rig.prove import steps
     from rig_workbench.commission import setup as wizard
 
@@ -51,39 +47,25 @@ def setup(
         bus=bus, imu=imu, units=units, values=values, home=home, axes=axes,
         drives=drives, readings=readings, model=urdf,
     )  # fmt: skip
-    if given.simulate and (axes or drives or readings or urdf):
+    if given.simulate:
         raise Refused(
-            "--simulate commissions the simulated device: leave out --axes, --drives, "
-            "--readings and --urdf"
+            "setup writes the file of a device. To practise, type `jaxcal-rig "
+            "simulate` in another terminal, and leave out --simulate here"
         )
-    with contextlib.ExitStack() as stack:
-        if given.simulate:
-            device = dataclasses.replace(given, config=None)
-            simulator = stack.enter_context(device.simulator(device.load()))
-            asked = wizard.simulated(simulator, asked)
-            output = Path(simulator.config.output)
-            path = given.config or new_run_folder(output, "simulated") / "rig.toml"
-            if path.exists():  # its bus may be that of a real device
-                raise Refused(
-                    f"{path} exists: --simulate writes a new file. Name a new file, or "
-                    "leave out --config or --simulate"
-                )
-        config = wizard.begin(path, asked, operator)
-        site = steps.Site(
-            config, DeviceRecord.load(config.device_path), operator, path,
-            reset_alarms=given.reset_alarms, full_speed=given.simulate,
-        )  # fmt: skip
-        return wizard.go(site, asked)
+    config = wizard.begin(path, asked, operator)
+    record = DeviceRecord.load(config.device_path)
+    site = steps.Site(config, record, operator, path, reset_alarms=given.reset_alarms)
+    return wizard.go(site, asked)
 
 
 def imu(
     given: Step, *, seconds: Annotated[float, "to look at it", (1, 600)] = 5.0
 ) -> int:
     """what to type into the phone, and what it sends"""
-    from rig_workbench.commission import connections, setup
+    from rig_workbench.commission import setup
 
     with place(given) as site:
-        setup.pin(site, connections.look_at_phone(site, seconds))
+        setup.pin(site, setup.look_at_phone(site, seconds))
     return EXIT_OK
 
 
@@ -126,9 +108,6 @@ def refit(
     run: RunPath,
     *,
     order: Annotated[Order, "mechanism.order: axes of the joints"] | None = None,
-    imu_order: Annotated[Order, "imu.order: order of the phone's angles"] | None = None,
-    signs: Annotated[tuple[int, int, int], "imu.signs", (-1, 1)] | None = None,
-    mounting: Annotated[Angles, "imu.mounting_deg: Z, Y, X", CIRCLE] | None = None,
     factory: Annotated[str, "program of its [model] that may be run"] = "",
 ) -> int:
     """identify a recorded calibration anew"""
@@ -144,13 +123,7 @@ def refit(
             f"{run} names [model] factory = {model!r}, a program that refit would run"
             + (f": give --factory {model}" if model else f", not {factory!r}")
         )
-    values = {
-        "mechanism.order": order,
-        "imu.order": imu_order,
-        "imu.signs": signs,
-        "imu.mounting_deg": mounting,
-    }
-    return identify_anew(run, records_of(run), then, values, print)
+    return identify_anew(run, records_of(run), then, order, print)
 
 
 def report(run: RunPath) -> int:
@@ -165,7 +138,7 @@ def report(run: RunPath) -> int:
 def export(
     run: RunPath,
     *,
-    to: Literal["c", "st", "ros", "json"],
+    to: Literal["c", "st", "json"],
     out: Annotated[Path, "file to write; default: print it"] | None = None,
 ) -> int:
     """print the inverse map of a calibration for a controller"""
@@ -187,7 +160,7 @@ def export(
 
 def trend(folder: Annotated[Path, "of runs, searched with its subfolders"]) -> int:
     """compare the calibrations of a device over time"""
-    from rig_workbench.outputs.trend import read_runs, trend_lines, write_trend
+    from rig_workbench.outputs.trend import read_runs, trend_lines
 
     if not folder.is_dir():
         raise Refused(f"{folder} is not a folder")
@@ -196,11 +169,10 @@ def trend(folder: Annotated[Path, "of runs, searched with its subfolders"]) -> i
         print(f"left out: {text}", file=sys.stderr)
     if not devices:
         raise Refused(f"{folder} has no finished calibration or verification")
-    for device in devices:
-        print(*trend_lines(device), sep="\n")
-    print(f"saved: {write_trend(folder, devices)}")
-    again = any(device.reasons for device in devices)
-    return EXIT_RECALIBRATE if again else EXIT_OK
+    trends = [trend_lines(runs) for runs in devices]
+    for lines, _ in trends:
+        print(*lines, sep="\n")
+    return EXIT_RECALIBRATE if any(again for _, again in trends) else EXIT_OK
 
 
 def simulate(

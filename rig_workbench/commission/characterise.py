@@ -1,12 +1,9 @@
 """Play, dead zone and breakaway of one axis.
 
-Play and dead zone have a fixed plan of PAIRS differences. The play comes first, away
-from where a dead zone may be: of one place that is reached from either side. Then the
-dead zone, always from below, so that the play shifts all alike: of its two sides. Then
-the breakaway: steps from rest, on in the direction in which the axis came, so that no
-play enters; there every step follows from the last.
-
-Ways are degrees of the axis's commands from where it stood, upwards.
+First the play: PAIRS differences of one place reached from either side, away from where
+a dead zone may be. Then the dead zone: of its two sides, reached from below, so that
+the play shifts all alike. Then the breakaway: steps from rest, on in the direction in
+which the axis came. Ways are degrees of its commands from where it stood, upwards.
 """
 
 from __future__ import annotations
@@ -51,10 +48,6 @@ class Estimate(NamedTuple):
     mean: float
     low: float
     high: float
-
-    @property
-    def width(self) -> float:
-        return self.high - self.low
 
 
 class Breakaway:
@@ -227,7 +220,8 @@ class Probe:
         belief = Breakaway(least, STEPS, 2.0**0.5 * sigma, least / 2.5)
         for count in range(1, MOST_STEPS + 2):
             up, down = (belief.estimate(side, LEVEL) for side in (0, 1))
-            if count > MOST_STEPS or max(up.width, down.width) <= ENOUGH_DEG:
+            widest = max(up.high - up.low, down.high - down.low)
+            if count > MOST_STEPS or widest <= ENOUGH_DEG:
                 break
             side, number = belief.propose(OVERSHOOT_DEG, RISK)
             step, direction = float(belief.steps[number]), 1.0 - 2.0 * side

@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import pathlib
 import re
 import socket
+import time
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from jaxcal.files import write_text
 from rig.config import RigConfig, load_config, parse_config
 from rig.config.axis import DEFAULT_ROTATES as DEFAULT_AXES
-from rig.config.settings import BusSettings
+from rig.config.settings import BusSettings, ImuSettings, ReadingsSettings
+from rig.core.session import STREAM_WAIT_S
 from rig.faults import EXIT_OK, Refused
 from rig.journal.device import HOMED, IDENTIFIED, STOP_PROVED, ZEROED
 from rig.prove import steps
 from rig.prove.home import can_home
 from rig.prove.scan import OF_LINE, Answer, parse_bus, place_of, scan, serial_lines
 from rig.prove.steps import Operator, edit, set_values
-from rig_workbench.commission.connections import look_at_phone
+from rig.readings import make_source
+from rig.readings.geometry import Attitudes, Geometry, geometry_of
+from rig.readings.phone import Imu
+from rig.readings.source import Source
 from rig_workbench.model import joint_names
 from rig_workbench.outputs import template
 
 if TYPE_CHECKING:
-    from rig.parts import SimulatedDevice
+    pass
 
 FORMATS = ["hyperimu", "sensorlogger", "sensorlog", "json", "lines"]
 SAFETY = (
@@ -119,25 +127,6 @@ def setting(text: str) -> tuple[str, Any]:
         return key, value
 
 
-def simulated(simulator: SimulatedDevice, options: SetupOptions) -> SetupOptions:
-    """What an operator would answer of a simulated device, and its phone started."""
-    bus = simulator.start().bus
-    where = f"{bus.transport}:{bus.host}:{bus.port}"
-    if bus.transport == "rtu":
-        where = f"rtu:{bus.device},{bus.baudrate},N,8,1"
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    simulator.start_phone(port)
-    imu = simulator.config.phone
-    values: dict[str, Any] = {"imu.host": "127.0.0.1", "imu.stale_s": imu.stale_s}
-    for axis in simulator.config.axes:
-        for name in ("reduction", "speed_deg_s", "accel_deg_s2"):
-            values[f"axes.{axis.name}.{name}"] = getattr(axis, name)
-    return dataclasses.replace(
-        options, bus=where, imu=f"{imu.format}:{port}", values=values | options.values
-    )
-
-
 def begin(path: pathlib.Path, options: SetupOptions, operator: Operator) -> RigConfig:
     """The configuration of a file, which is written where there is none."""
     operator.confirm(SAFETY, "setup")
@@ -207,15 +196,8 @@ def new_text(
     model: str = "",
     **numbers: Any,
 ) -> str:
-    """A whole configuration.
-
-    Args:
-        bus: as it was reached.
-        axes: name, kind, unit, family, pulses and, of mm, lead of each.
-        form, port: of the phone's app, and that it connects to.
-        model: URDF file of an arm.
-        numbers: without a phone ``names`` and ``unit`` of readings, and ``sensor``.
-    """
+    """A whole configuration: ``axes`` have name, kind, unit, family, pulses and, of mm,
+    lead; ``form`` is the phone's app, else ``numbers`` are names, unit and sensor."""
     keys = OF_LINE[bus.transport] + ("echo",) * bus.echo
     new = template(pathlib.Path(__file__).with_name("new.toml.j2"))
     told = numbers | {"form": form, "port": port, "model": model}
@@ -318,3 +300,91 @@ def _ask_limits(site: steps.Site) -> None:
                 values[f"axes.{axis.name}.{axis.key_of(name)}"] = number
     if values:
         site.take(edit(site.path, values))
+
+
+# What the phone sends
+
+WATCH_S = 5.0
+SHOWN = 300  # letters of a record
+LOOK_S = 1.0
+# Below these a session's settle window would hardly ever fill.
+SLOW_HZ, LONG_GAP_S = 5.0, 0.3
+
+
+def look_at_phone(site: steps.Site, seconds: float = WATCH_S) -> str:
+    """Wait for the phone and tell what it sends; its address."""
+    config = site.config
+    with make_source(config) as imu:
+        site.say(
+            f"imu: {place_text(config.source, imu.port)}; then start its "
+            f"stream (waiting up to {STREAM_WAIT_S:g} s)"
+        )
+        for listener in site.listeners:
+            listener({"event": "listening", "port": imu.port})
+        geometry = geometry_of(config)
+        watch(imu, geometry, seconds, STREAM_WAIT_S, site.say)
+        if isinstance(imu, Imu):
+            sent = imu.parser
+            site.say(f"  it sends {sent.first[:SHOWN]}\n  read as {sent.taken_for}")
+        return imu.sender
+
+
+def place_text(settings: ImuSettings | ReadingsSettings, port: int) -> str:
+    """What to type into the phone's app, or where a sensor's numbers come from."""
+    place = f"{reached_at(settings.host)} port {port}"
+    if settings.transport in ("listen", "udp"):
+        if isinstance(settings, ImuSettings):
+            return f"type into the phone's app ({settings.format}): {place}"
+        return f"waiting for the sensor on {place}"
+    return f"readings from {getattr(settings, 'device', '') or place}"
+
+
+def watch(
+    imu: Source,
+    geometry: Geometry,
+    seconds: float,
+    wait_s: float,
+    say: Callable[[str], None],
+) -> None:
+    """Wait for an open stream and look at it for so long, telling each second;
+    ReadingError where nothing comes, or the stream is not to be trusted."""
+    start, spent = imu.wait_for_stream(wait_s).time, 0.0
+    while spent < seconds:
+        time.sleep(min(LOOK_S, seconds - spent))
+        imu.latest()
+        readings, spent = imu.since(start), time.monotonic() - start
+        gaps = np.diff([reading.time for reading in readings])
+        values = [reading.value for reading in readings[-500:]]
+        mean = geometry.mean(values)
+        apart = [geometry.apart(mean, value) for value in values]
+        scatter = float(np.sqrt(np.mean(np.square(apart)) / len(mean)))
+        stands = "reads " + " ".join(f"{value:.6g}" for value in np.ravel(mean))
+        if isinstance(geometry, Attitudes):
+            tilt = np.degrees(np.arccos(np.clip(mean[2, 2], -1.0, 1.0)))
+            stands = f"tilt {tilt:.1f} deg"
+        dropped = [f"{n} {why}" for why, n in imu.counts.items() if why != "accepted"]
+        rate, gap = len(readings) / spent, float(gaps.max(initial=0.0)) or spent
+        say(
+            f"  {rate:.0f} readings per s, longest gap {gap:.2f} s, scatter "
+            f"{scatter:.3g}, {stands}, dropped: " + (", ".join(dropped) or "none")
+        )
+    if rate < SLOW_HZ or gap > LONG_GAP_S:
+        say(
+            f"  note: sessions need {SLOW_HZ:g} readings per s without gaps over "
+            f"{LONG_GAP_S:g} s. {imu.lost}, raise its rate; or raise "
+            f"{imu.table}.stale_s and settle.window_s"
+        )
+
+
+def reached_at(host: str) -> str:
+    """IPv4 address under which a phone reaches what listens on ``host``."""
+    if host not in ("0.0.0.0", "::"):
+        return host
+    # Connecting UDP sends nothing; it tells the address packets leave from.
+    with (
+        contextlib.suppress(OSError),
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
+    ):
+        probe.connect(("192.0.2.1", 9))
+        return str(probe.getsockname()[0])
+    return "(this computer has no network address)"

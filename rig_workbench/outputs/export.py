@@ -3,7 +3,7 @@
 C and Structured Text compute the same: a desired posture to commands in degrees and
 pulses; beyond the limits as `command_for(..., clip=True)`, with a status of one bit for
 each axis that is held at a limit. An input that is not a finite number sets the status
-and nothing else. JSON and ROS parameters hold the numbers.
+and nothing else. JSON holds the numbers.
 """
 
 from __future__ import annotations
@@ -175,23 +175,9 @@ def _c(value: Any) -> str:
 
 
 def _real(value: float) -> str:
-    """1e-07 with the point that YAML and Structured Text want: 1.0e-07."""
+    """1e-07 with the point that Structured Text wants: 1.0e-07."""
     mantissa, e, exponent = repr(float(value)).partition("e")
     return mantissa + ".0" * ("." not in mantissa) + e + exponent
-
-
-def _ros(inverse: dict[str, Any]) -> str:
-    """Matrices row by row: ROS has no nested lists; and no empty ones."""
-    told = [f"{key} = {json.dumps(value)}" for key, value in inverse["device"].items()]
-    texts = {"device": told, "warnings": inverse["warnings"] or [""]}
-    lines = [f"# {line}" for line in _origin(inverse)]
-    lines += ["/**:", "  ros__parameters:", "    jaxcal:"]
-    for name, value in (inverse | texts).items():
-        values = np.ravel(value).tolist()
-        written = [_real(v) if isinstance(v, float) else json.dumps(v) for v in values]
-        text = written[0] if isinstance(value, str) else f"[{', '.join(written)}]"
-        lines.append(f"      {name}: {text}")
-    return "\n".join([*lines, ""])
 
 
 def _json(inverse: dict[str, Any]) -> str:
@@ -202,6 +188,5 @@ def _json(inverse: dict[str, Any]) -> str:
 LANGUAGES: dict[str, Callable[[dict[str, Any]], str]] = {
     "c": lambda inverse: _code("calibration.h.j2", inverse),  # C99
     "st": lambda inverse: _code("calibration.st.j2", inverse),  # IEC 61131-3
-    "ros": _ros,  # a ROS 2 parameter file
     "json": _json,
 }

@@ -8,14 +8,14 @@ from rig.config import load_config
 from rig.core import proof
 from rig.journal.device import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.prove import stops
-from rig_workbench.commission import connections
+from rig_workbench.commission import setup as wizard
 
 
 @pytest.fixture
 def at(tmp_path, monkeypatch):
     """An empty folder to work in, and axes that need not be watched by a person."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(connections, "WATCH_S", 0.3)
+    monkeypatch.setattr(wizard, "WATCH_S", 0.3)
     monkeypatch.setattr(proof, "SLOW_DEG_S", 400.0)
     monkeypatch.setattr(proof, "LOOK_S", 0.01)
     monkeypatch.setattr(stops, "SPEED_DEG_S", 10.0)

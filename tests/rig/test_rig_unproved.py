@@ -17,7 +17,7 @@ from rig.core.proof import GROWTH, Reach
 from rig.faults import MotionFault, Refused
 from rig.prove.axis_check import require_gearing, require_unit
 from rig.prove.steps import Operator
-from rig_workbench.commission import connections
+from rig_workbench.commission import setup as wizard
 from rig_workbench.simulator import Truth, parse_fault
 from rig_workbench.simulator.drive import SimDrive
 
@@ -27,7 +27,7 @@ def slow(at, monkeypatch):
     """Speeds as they are with a real device."""
     monkeypatch.undo()
     monkeypatch.chdir(at)
-    monkeypatch.setattr(connections, "WATCH_S", 0.3)
+    monkeypatch.setattr(wizard, "WATCH_S", 0.3)
     return at
 
 
