@@ -20,13 +20,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
 
     The bytes go to a new file in the same folder, reach the disk (fsync) and are then
     renamed over ``path``. If the block raises or the process dies, ``path`` is what it
-    was.
-
-    Args:
-        path: the file to make or replace; its folder must exist.
-
-    Raises:
-        OSError: the folder is missing, not writable or full.
+    was. OSError: the folder is missing, not writable or full.
     """
     target = pathlib.Path(path).resolve()
     if target.exists() and not target.is_file():
@@ -63,21 +57,14 @@ def _sync_folder(folder: pathlib.Path) -> None:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write UTF-8 text atomically.
-
-    Raises:
-        OSError: the folder is missing, not writable or full; the old file stays.
-    """
+    """Write UTF-8 text atomically; OSError: the old file stays."""
     with atomic_write(path) as file:
         file.write(text.encode("utf-8"))
 
 
 def write_over(path: str | os.PathLike[str], text: str, force: bool) -> None:
-    """Write a text of any bytes (surrogates), over a file that is there by ``force``.
-
-    Raises:
-        FileExistsError: there is a file and no ``force``.
-    """
+    """Write a text of any bytes (surrogates), over a file that is there by ``force``,
+    else FileExistsError."""
     if not force and os.path.exists(path):
         raise FileExistsError(
             f"{os.fspath(path)} exists; pass force=True to replace it"

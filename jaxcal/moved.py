@@ -58,6 +58,7 @@ MOVED = {  # longer names first
     "rig.workbench.commission.operator": "rig.prove.steps",
     "rig.workbench.commission": "rig.prove",
     "rig.workbench.identification.refit": "rig_workbench.refit",
+    "rig.workbench.live.scene": "rig_workbench.live.page",
     "rig.workbench.live": "rig_workbench.live",
     "rig.workbench.outputs.export": "rig_workbench.outputs.export",
     "rig.workbench.outputs.report": "rig_workbench.outputs.report",

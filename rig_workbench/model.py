@@ -135,10 +135,7 @@ class DeviceModel:
 
 def parameters(calibration: Any) -> dict[str, Record]:
     """What was fitted, by its name: designed, found, half-width of its interval."""
-    fixed = np.zeros(len(calibration.names), dtype=bool)
     errors = calibration.standard_errors
-    if errors is not None:
-        fixed = np.asarray(errors) == 0.0
     return {
         name: {
             "designed": float(calibration.model.nominal[i]),
@@ -146,7 +143,7 @@ def parameters(calibration: Any) -> dict[str, Record]:
             "half_width": None if errors is None else WIDE * float(errors[i]),
         }
         for i, name in enumerate(calibration.names)
-        if not fixed[i]
+        if errors is None or errors[i] != 0.0
     }
 
 

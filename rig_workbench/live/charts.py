@@ -6,11 +6,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from rig.outputs.run_state import ACTIVE, Record, RunState
+from rig.outputs.run_state import Record, RunState
 
 # Of axes and of what is measured, in their order; on light and dark.
 AXIS_COLORS = ["#3b9de0", "#e39a12", "#1fae85", "#b07ce8", "#e0568f", "#8c98a6"]
-MARK_COLORS = ["#8c98a655", "#e39a12", "#3b9de0", "#1fae85"]  # of `_commands`
 TEXT, GRID = "#7b8794", "#8793a055"  # on both, too: style sheets do not reach a canvas
 SHOWN_S = 30.0  # of telemetry
 POINTS = 300  # of a line, at most
@@ -57,39 +56,8 @@ def charts(
     return {
         "Angles": _chart(state, recent, angles),
         "Settling": _chart(state, recent, settling, type="log", min=0.001, max=100),
-        "Commands": _commands(state),
         "Drift": _chart(state, since, drift),
     }
-
-
-def _commands(state: RunState) -> dict[str, Any]:
-    """Where the commands lie: the first axis to the right, the second upwards, the
-    third as the size."""
-    postures = [p for p in state.postures.values() if p.commanded]
-    groups: dict[str, list[Any]] = {
-        "candidate": state.candidates,
-        "to come": [p.commanded for p in postures],
-        "now": [p.commanded for p in postures if p.state in ACTIVE],
-        "measured": [p.commanded for p in state.done],
-    }
-    ranges = state.setting("session", "ranges", [])
-
-    def mark(point: Any) -> Record:
-        size = 9.0
-        if len(point) > 2 and len(ranges) > 2:
-            low, high = ranges[2]
-            size = 5 + 8 * (point[2] - low) / (high - low)
-        return {"value": [*point, 0.0][:2], "symbolSize": size}
-
-    series = [
-        {"type": "scatter", "name": name, "data": [mark(point) for point in points]}
-        for name, points in groups.items()
-    ]
-    unit = "degrees" if state.axis_unit == "deg" else state.axis_unit
-    right, up, *_ = [*(f"{name}, {unit}" for name in state.names[0]), "", ""]
-    chart = _chart(state, {"name": right, "scale": True}, series, name=up)
-    chart["legend"] |= {"data": list(groups)}
-    return chart | {"color": MARK_COLORS}
 
 
 def _chart(
