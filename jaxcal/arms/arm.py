@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.chain_kernel import forward
+from jaxcal.arms.files.urdf import joints_of
 from jaxcal.arms.sensors import Reading, Sensor, Tip
+from jaxcal.arms.sensors.sensor import BASE, Readings
 from jaxcal.checks import Array, array_of, numbers
 from jaxcal.models.model import as_commands
 
+_T = TypeVar("_T")
 Load = tuple[int, float, tuple[float, float, float]]  # link from 1, weight, its centre
 
+COLUMNS = ("a", "alpha", "d", "theta", "beta")
+WAVES = ("sin", "cos", "sin2", "cos2")
 # The steps of the base: three shifts, three turns, its nominal rotation; five of each
 # row of the table; the tool's three shifts, nominal rotation, three turns. A step is
 # 0, 1, 2, a shift along x, y, z, or 3, 4, 5, a turn about it, or 6 and on, a constant.
@@ -27,6 +32,24 @@ _PARALLEL, _CANCELS = 0.2, 3.0  # sine; times as long as what is left: lengths c
 _MANY = 2_000  # postures: what is found of so many is not kept
 # Where a, alpha, d, theta and beta act among the five steps of a row.
 _ORDER = {"standard": (2, 3, 1, 0, 4), "modified": (0, 1, 4, 3, 2)}
+
+
+def _kept(find: Callable[..., _T]) -> Callable[..., _T]:
+    """A method of arrays whose last answer, which a fit asks for again, is kept."""
+    name = f"_last{find.__name__}"
+
+    @functools.wraps(find)
+    def answer(arm: Arm, *key: Array) -> _T:
+        numbers = [array.tobytes() for array in key]
+        last = arm.__dict__.get(name)
+        if last is None or last[0] != numbers:
+            last = numbers, find(arm, *key)
+            if len(key[0]) < _MANY:
+                arm.__dict__[name] = last
+        result: _T = last[1]
+        return result
+
+    return answer
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,6 +107,65 @@ class Arm:
         own, waves = self.sensor.nominal, self.waves.ravel()
         return np.concatenate([self.table.ravel(), driven, base, tool, own, waves])
 
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """n names of the columns of the commands; () where the joints have none."""
+        if self.joint_names == numbered(self.num_joints):
+            return ()
+        return (*self.joint_names, *self.sensor.inputs)
+
+    @functools.cached_property
+    def command_units(self) -> tuple[str, ...]:
+        """J units of the joints' columns, "deg" or "length"."""
+        # A column drives itself by one, its gear ratio apart.
+        at = np.abs(np.abs(self.drive) - 1.0).argmin(axis=0)
+        kinds = [self.joints[joint] for joint in at]
+        plain = self.drive[at, range(len(at))] == 1.0
+        if self.source is not None and not plain.all():
+            in_file = joints_of(self.source["text"])
+            kinds = [in_file[name].kind for name in self.joint_names]
+        return tuple("deg" if kind == "R" else "length" for kind in kinds)
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        n = len(self.joints)
+        return (
+            *(f"{column}{i + 1}" for i in range(n) for column in COLUMNS),
+            *(f"gear{i}" for i in self.gears),
+            *(f"compliance{i}" for i in self.compliance),
+            *BASE,
+            *(f"tool {axis}" for axis in self.sensor.tool),
+            *self.sensor.names,
+            *(f"theta{i} {wave}" for i in self.harmonics for wave in WAVES),
+        )
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """p units: "length" (the table's), "deg", "ratio", "deg per torque", ..."""
+        row, mounting = ["length", "deg"] * 2 + ["deg"], ["length"] * 3 + ["deg"] * 3
+        driven = ["ratio"] * len(self.gears) + ["deg per torque"] * len(self.compliance)
+        tool, waves = [mounting[i] for i in self._tool], ["deg"] * self.waves.size
+        table = row * len(self.joints)
+        return (*table, *driven, *mounting, *tool, *self.sensor.units, *waves)
+
+    def own(self, i: int) -> slice:
+        """Where what the sensor's member ``i`` has of its own is among the p."""
+        at, before = self.sensor.own_of_members[i], self._at["sensor"].start
+        return slice(before + at.start, before + at.stop)
+
+    def readings(self, commands: Array, measured: Array | None) -> Iterator[Readings]:
+        """What each of its sensors reads, from where the nominal arm has it."""
+        inputs = commands[:, self.num_joints :]
+        return self.sensor.of_members(self.nominal_tip(commands), inputs, measured)
+
+    def skeleton(self, commands: ArrayLike) -> Array:
+        """(N, n + 2, 3) the base, each joint's origin and the tip, to be drawn."""
+        commands = as_commands(self, commands)
+        frame, _, origins = self._chain(commands, self.nominal)
+        at = np.concatenate([[0], self._steps_of_joints])
+        points = np.concatenate([origins[at], frame[None, 3]])
+        return np.asarray(points.transpose(2, 0, 1))
+
     def rotation_vectors(self, commands: ArrayLike, rotations: ArrayLike) -> Array:
         """Measured rotations (N, 3, 3) at commands (N, n) as turns from nominal (N, 3).
 
@@ -91,7 +173,7 @@ class Arm:
         """
         commands = as_commands(self, commands)
         rotations = array_of("rotations", rotations, len(commands), 3, 3)
-        nominal = self._nominal_rotations(commands)
+        nominal = self.nominal_tip(commands).rotation
         turn = rotations @ np.matrix_transpose(nominal)
         return np.asarray(Rotation.from_matrix(turn).as_rotvec(degrees=True))
 
@@ -99,16 +181,7 @@ class Arm:
         """Rotation matrices (N, 3, 3) of turns from nominal (N, 3) in degrees."""
         commands = as_commands(self, commands)
         turn = Rotation.from_rotvec(numbers("vectors", vectors), degrees=True)
-        return np.asarray(turn.as_matrix() @ self._nominal_rotations(commands))
-
-    def nominal_tips(self, commands: Array) -> Array:
-        """(N, 3) the measured point of the nominal arm."""
-        return np.ascontiguousarray(self._chain(commands, self.nominal)[0][3].T)
-
-    def _nominal_rotations(self, commands: Array) -> Array:
-        """(N, 3, 3) from the tool to the measuring frame."""
-        frame = self._chain(commands, self.nominal)[0]
-        return np.ascontiguousarray(frame[:3].transpose(2, 1, 0))
+        return np.asarray(turn.as_matrix() @ self.nominal_tip(commands).rotation)
 
     @functools.cached_property
     def _tool(self) -> list[int]:
@@ -148,23 +221,33 @@ class Arm:
         )
         return np.concatenate(parts)
 
+    @functools.cached_property
+    def _at(self) -> dict[str, slice]:
+        """Where parameters of each kind are among the p, in their order."""
+        sizes = {
+            "table": self.table.size,
+            "gears": len(self.gears),
+            "compliance": len(self.compliance),
+            "base": 6,
+            "tool": len(self._tool),
+            "sensor": len(self.sensor.names),
+            "harmonics": self.waves.size,
+        }
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        return dict(zip(sizes, map(slice, ends, ends[1:]), strict=True))
+
     def _split(self, parameters: Array) -> tuple[Array, Array, Array]:
         """Base (6,), tool (6,) and the sensor's own (s,)."""
-        end = len(parameters) - self.waves.size
-        last = end - len(self.sensor.names)
-        first = last - len(self._tool)
         tool = np.concatenate([self.tool[:3, 3], np.zeros(3)])
-        tool[self._tool] = parameters[first:last]
-        return parameters[first - 6 : first], tool, parameters[last:end]
+        tool[self._tool] = parameters[self._at["tool"]]
+        return parameters[self._at["base"]], tool, parameters[self._at["sensor"]]
 
     def _drives(self, parameters: Array) -> tuple[Array, Array, Array]:
         """Gear ratios (n,) of all joints, compliance (C,) and waves (H, 4)."""
-        first = 5 * len(self.joints)
-        last = first + len(self.gears)
         ratios = np.ones(len(self.joints))
-        ratios[[i - 1 for i in self.gears]] = parameters[first:last]
-        waves = parameters[len(parameters) - self.waves.size :].reshape(-1, 4)
-        return ratios, parameters[last : last + len(self.compliance)], waves
+        ratios[[i - 1 for i in self.gears]] = parameters[self._at["gears"]]
+        waves = parameters[self._at["harmonics"]].reshape(-1, 4)
+        return ratios, parameters[self._at["compliance"]], waves
 
     def _swing(self, commands: Array, parameters: Array) -> tuple[Array, Array]:
         """(H, 4, N) sin, cos of the joints and of twice them; (n, N) how far each joint
@@ -188,26 +271,10 @@ class Arm:
         """(N, n) how far each joint moves, before its gear."""
         return commands[:, : self.num_joints] @ self.drive.T + self.offset
 
-    def _kept(
-        self, name: str, key: tuple[Array, ...], find: Callable[[], tuple[Array, ...]]
-    ) -> tuple[Array, ...]:
-        """What ``find`` gives; the last answer, which a fit asks for again, is kept."""
-        numbers = [array.tobytes() for array in key]
-        kept = self.__dict__.get(name)
-        if kept is None or kept[0] != numbers:
-            kept = numbers, find()
-            if len(key[0]) < _MANY:
-                self.__dict__[name] = kept
-        arrays: tuple[Array, ...] = kept[1]
-        return arrays
-
-    def _chain(self, commands: Array, parameters: Array) -> tuple[Array, ...]:
+    @_kept
+    def _chain(self, commands: Array, parameters: Array) -> tuple[Array, Array, Array]:
         """The tool's frame (4, 3, N), axis and origin (S, 3, N) of each step."""
-        return self._kept(
-            "_last_chain",
-            (commands, parameters),
-            lambda: self._frames(commands, parameters)[:3],
-        )
+        return self._frames(commands, parameters)[:3]
 
     def _frames(
         self, commands: Array, parameters: Array, links: Sequence[int] = ()
@@ -236,20 +303,17 @@ class Arm:
 
     def nominal_tip(self, commands: Array) -> Tip:
         """What sensors read of the nominal arm."""
-        return self._tip_at(commands, self._chain(commands, self.nominal)[0])
+        return self._tip_at(commands, self.nominal)
 
-    def _tip_at(self, commands: Array, frame: Array) -> Tip:
-        return Tip(frame, lambda: self._nominal_rotations(commands), self.length)
+    def _tip_at(self, commands: Array, parameters: Array) -> Tip:
+        frame = self._chain(commands, parameters)[0]
+        return Tip(frame, lambda: self.nominal_tip(commands).rotation, self.length)
 
+    @_kept
     def _reading(self, commands: Array, parameters: Array) -> Reading:
         """Readings of the sensor, and their derivatives by the tip."""
-
-        def find() -> Reading:
-            tip = self._tip_at(commands, self._chain(commands, parameters)[0])
-            inputs = commands[:, self.num_joints :]
-            return self.sensor.read(tip, inputs, self._split(parameters)[2])
-
-        return Reading(*self._kept("_last_reading", (commands, parameters), find))
+        tip, inputs = self._tip_at(commands, parameters), commands[:, self.num_joints :]
+        return self.sensor.read(tip, inputs, self._split(parameters)[2])
 
     def _motion(
         self, commands: Array, parameters: Array, at: NDArray[np.int64]
@@ -291,18 +355,15 @@ class Arm:
         slopes[shifts] = np.einsum("skn,skn->s", before[joints], axes[at]) / square[0]
         return np.broadcast_to(slopes, (len(commands), len(slopes)))
 
-    def _levers(self, commands: Array, parameters: Array) -> tuple[Array, ...]:
+    @_kept
+    def _levers(self, commands: Array, parameters: Array) -> tuple[Array, Array]:
         """(n, 3, N) from the axis of each joint to the tip, (N,) all their squares."""
-
-        def find() -> tuple[Array, Array]:
-            frame, axes, origins = self._chain(commands, parameters)
-            about = axes[self._steps_of_joints]
-            levers = frame[3] - origins[self._steps_of_joints]
-            levers -= about * np.einsum("jkn,jkn->jn", about, levers)[:, None]
-            levers[~self._revolute] = 0.0
-            return levers, np.full(len(commands), np.vdot(levers, levers))
-
-        return self._kept("_last_levers", (commands, parameters), find)
+        frame, axes, origins = self._chain(commands, parameters)
+        about = axes[self._steps_of_joints]
+        levers = frame[3] - origins[self._steps_of_joints]
+        levers -= about * np.einsum("jkn,jkn->jn", about, levers)[:, None]
+        levers[~self._revolute] = 0.0
+        return levers, np.full(len(commands), np.vdot(levers, levers))
 
     def _grows(self, commands: Array) -> bool:
         """Whether some of what it reads is zero, and grows with the arm."""
@@ -328,9 +389,8 @@ class Arm:
     def _pulled(self, commands: Array) -> tuple[Array, list[tuple[Array, Array]]]:
         """The nominal arm's axes (n, 3, N); of each load its force (3,), and how its
         point moves by each joint (n, 3, N)."""
-        first = self.table.size + len(self.gears)
         stiff = self.nominal
-        stiff[first : first + len(self.compliance)] = 0.0
+        stiff[self._at["compliance"]] = 0.0
         links = [link for link, _, _ in self.loads]
         _, axes, origins, ends = self._frames(commands, stiff, links)
         axes, origins = axes[self._steps_of_joints], origins[self._steps_of_joints]
@@ -343,17 +403,14 @@ class Arm:
             pulls.append((weight * np.array(self.gravity), motion))
         return axes, pulls
 
+    @_kept
     def _torque(self, commands: Array) -> Array:
         """(C, N) torques of the loads on the compliant joints of the nominal arm."""
-
-        def find() -> tuple[Array]:
-            at = np.array(self.compliance) - 1
-            torque = np.zeros((len(at), len(commands)))
-            for force, motion in self._pulled(commands)[1]:
-                torque += np.einsum("c,jcn->jn", force, motion[at])
-            return (torque,)
-
-        return self._kept("_last_torque", (commands,), find)[0]
+        at = np.array(self.compliance) - 1
+        torque = np.zeros((len(at), len(commands)))
+        for force, motion in self._pulled(commands)[1]:
+            torque += np.einsum("c,jcn->jn", force, motion[at])
+        return torque
 
     def _torque_slopes(self, commands: Array) -> Array:
         """(C, n, N) of the torques by the joints, per degree or unit of length.
@@ -371,6 +428,11 @@ class Arm:
             rate += np.einsum("c,ijcn->ijn", force, bent)
         rate[:, self._revolute] = np.radians(rate[:, self._revolute])
         return rate
+
+
+def numbered(columns: int) -> tuple[str, ...]:
+    """Names of joints that have none."""
+    return tuple(f"joint {i + 1}" for i in range(columns))
 
 
 def apparent_length(table: Array, tool: Array) -> tuple[float, int]:

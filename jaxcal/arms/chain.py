@@ -6,12 +6,11 @@ import dataclasses
 import functools
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.arguments import (
     joint_kinds,
@@ -23,32 +22,26 @@ from jaxcal.arms.arguments import (
     sensor_of,
     transform,
 )
-from jaxcal.arms.arm import Arm, Load, apparent_length
-from jaxcal.arms.files.urdf import joints_of, read_ur_kinematics, read_urdf
+from jaxcal.arms.arm import Arm, Load, apparent_length, numbered
+from jaxcal.arms.files.urdf import read_ur_kinematics, read_urdf
 from jaxcal.arms.sensors import Position, Sensor, Several
-from jaxcal.arms.sensors.sensor import BASE
 from jaxcal.arms.sensors.several import OneTable, stacked
 from jaxcal.checks import Array, array_of, axis_names, numbers, one_of
 from jaxcal.late import late
 from jaxcal.models.model import ErrorGroups, Model, Quantity, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise, Prior
 
-COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # Standard deviations of the default prior. On a UR5 (links of 1.19 m in all): 1.8 mm,
 # 0.3 degrees of the axes and 0.5 of a joint's zero, which is set by hand; 0.12 m and
 # 1.7 degrees of the base and the tool.
 _LENGTH, _TWIST, _ZERO = 1.5e-3, 0.3, 0.5  # share of the links' length; degrees
 _GEAR, _SAG = 5e-3, 0.5  # ratio; degrees under the largest torque
-WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.045  # of gears; degrees
+_WAVE = 0.045  # degrees, of gears
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
-# Of the arm's length: positions so far off are in another frame; so alike, of this arm.
-_NEAR, _ALIKE = 0.2, 0.05
 # How large the errors of a group are beside the prior's, beforehand: lengths, turns of
 # the axes, zeros of the joints, compliance, harmonics. Most arms have little misfit and
 # some have much.
 _SIZES, _SIZES_SPREAD = (1.0, 1.0, 1.0, 1.0, 0.1), (6.0, 6.0, 6.0, 6.0, 10.0)
-# Farther away, or turned by more than 37 degrees (a cosine), no fit of poses finds it.
-_AWAY, _ASIDE = 1.5, 0.8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -70,13 +63,17 @@ class SerialChain(Arm, Model):
     """
 
     # Of modules that know this one.
-    prepared = late("jaxcal.arms.plausible:prepared")
+    located = late("jaxcal.arms.located:located")
+    anew = late("jaxcal.arms.located:anew")
+    prepared = late("jaxcal.arms.located:prepared")
     require_commands = late("jaxcal.arms.plausible:require_commands")
     postures = late("jaxcal.arms.postures:postures")
     reachable = late("jaxcal.arms.postures:reachable")
     in_turn = late("jaxcal.arms.postures:in_turn")
     improved = late("jaxcal.arms.effects:improved")
     unexplained = late("jaxcal.arms.effects:unexplained")
+    noise_with_play = late("jaxcal.arms.effects:noise_with_play")
+    from_one_side = late("jaxcal.arms.effects:from_one_side")
     verdict = late("jaxcal.arms.verdict:verdict")
     at_rest = late("jaxcal.arms.files.recordings:at_rest")
     recorded = late("jaxcal.arms.files.recordings:recorded")
@@ -117,8 +114,7 @@ class SerialChain(Arm, Model):
             base: where the arm stands in the measuring frame: (3,) or (4, 4).
             tool: the measured point in the last link's frame: (3,) or (4, 4).
             sensor: measures the tip, or its ``to_dict()``; Position() when not given.
-            gears: joints, from 1, whose gear ratio, nominally 1, is a parameter
-                ("gear2").
+            gears: joints, from 1, whose gear ratio is a parameter ("gear2").
             compliance: revolute joints, from 1, that yield under the loads
                 ("compliance2"): degrees per unit of weight times length. By default all
                 for contacts, else none.
@@ -128,12 +124,10 @@ class SerialChain(Arm, Model):
             waves: (H, 4) these in degrees, nominally.
             loads: (link, weight, centre in the frame of that row); by default a weight
                 of one at the end of every link but the first, the last at the tool.
-                The torques are those of the nominal arm.
             gravity: direction of weight in the measuring frame; times 9.81 where
                 loads are masses.
             joint_names: of the columns of the commands.
-            drive: (n, J) how far each joint moves with each of J columns, where they
-                are not the same (a joint that mimics another).
+            drive: (n, J) how far each joint moves with each of J columns.
             offset: (n,) where each joint is at commands of zero.
             limits: (J, 2) least and greatest command of each column.
             source: the URDF file that the arm comes from: text, base, tip, locked.
@@ -180,7 +174,7 @@ class SerialChain(Arm, Model):
             array_of("waves", swings.reshape(-1, 4), len(bent), 4),
             tuple(load(one, n) for one in loads),
             tuple(array_of("gravity", gravity, 3).tolist()),
-            axis_names("joint_names", joint_names or _numbered(columns), "", columns),
+            axis_names("joint_names", joint_names or numbered(columns), "", columns),
             moves,
             at_zero,
             limits_of(limits, columns),
@@ -263,22 +257,22 @@ class SerialChain(Arm, Model):
     def with_effects(
         self,
         *,
-        compliance: Sequence[int] | None = None,
-        gears: Sequence[int] | None = None,
-        harmonics: Sequence[int] | None = None,
+        compliance: Sequence[int] = (),
+        gears: Sequence[int] = (),
+        harmonics: Sequence[int] = (),
     ) -> Self:
-        """This arm with these effects of joints, from 1, as of ``from_dh``."""
-        arm: dict[str, Any] = {}
-        if compliance is not None and not self.compliance:
-            arm["compliance"] = tuple(compliance)
-            arm["yields"] = np.zeros(len(arm["compliance"]))
-            arm["loads"] = self.loads or _usual_loads(len(self.joints), self.tool)
-        if gears is not None:
-            arm["gears"] = tuple(gears)
-        if harmonics is not None and not self.harmonics:
-            arm["harmonics"] = tuple(harmonics)
-            arm["waves"] = np.zeros((len(arm["harmonics"]), 4))
-        return dataclasses.replace(self, **arm)
+        """This arm with these effects of joints, from 1, beside those that it has."""
+        arm = self
+        if compliance and not arm.compliance:
+            loads = arm.loads or _usual_loads(len(arm.joints), arm.tool)
+            arm = dataclasses.replace(arm, compliance=tuple(compliance), loads=loads)
+            arm = dataclasses.replace(arm, yields=np.zeros(len(compliance)))
+        if gears:
+            arm = dataclasses.replace(arm, gears=tuple(gears))
+        if harmonics and not arm.harmonics:
+            waves = np.zeros((len(harmonics), 4))
+            arm = dataclasses.replace(arm, harmonics=tuple(harmonics), waves=waves)
+        return arm
 
     @functools.cached_property
     def _bent(self) -> Self:  # kept, and what it keeps with it
@@ -299,13 +293,6 @@ class SerialChain(Arm, Model):
     def sensed(self) -> slice:
         return slice(self.num_joints, self.num_inputs)
 
-    def anew(self, commands: Array, measured: Array) -> Self:
-        """This arm located again, what its sensor reads forgotten."""
-        names = {field.name for field in dataclasses.fields(self.sensor)}
-        places = {name: None for name in ("place", "places") if name in names}
-        arm = self.measured_with(dataclasses.replace(self.sensor, **places))
-        return arm.located(commands, measured if measured.any() else None)
-
     def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
         kept = [np.zeros(0, dtype=np.intp)]
         for _, one, rows, _ in self.sensor.parts(commands[:, self.num_joints :]):
@@ -313,14 +300,6 @@ class SerialChain(Arm, Model):
                 rows = rows[np.unique(commands[rows], axis=0, return_index=True)[1]]
             kept.append(rows)
         return np.sort(np.concatenate(kept))
-
-    def skeleton(self, commands: ArrayLike) -> Array:
-        """(N, n + 2, 3) the base, each joint's origin and the tip, to be drawn."""
-        commands = as_commands(self, commands)
-        frame, _, origins = self._chain(commands, self.nominal)
-        at = np.concatenate([[0], self._steps_of_joints])
-        points = np.concatenate([origins[at], frame[None, 3]])
-        return np.asarray(points.transpose(2, 0, 1))
 
     def calibrated(self, parameters: ArrayLike, sensor: Sensor | None = None) -> Self:
         """The arm whose nominal is this one with ``parameters`` (p,), with a
@@ -348,8 +327,10 @@ class SerialChain(Arm, Model):
         """This arm with stiff joints and round gears, as files have them."""
         if not self.compliance and not self.harmonics:
             return self
-        arm = dataclasses.replace(self, compliance=(), yields=np.zeros(0))
-        return dataclasses.replace(arm, harmonics=(), waves=np.zeros((0, 4)))
+        round_gears = {"harmonics": (), "waves": np.zeros((0, 4))}
+        return dataclasses.replace(
+            self, compliance=(), yields=np.zeros(0), **round_gears
+        )
 
     def together(
         self, *tables: tuple[ArrayLike, ArrayLike | None]
@@ -375,87 +356,6 @@ class SerialChain(Arm, Model):
             noise = one.stds(self.length)
             named.append(OneTable(one.kind, i, [*range(j), *at], noise, given, read))
         return stacked(named, j, self.num_inputs, self.num_outputs)
-
-    def located(self, commands: ArrayLike, measured: ArrayLike | None = None) -> Self:
-        """This arm with its sensor located by nominal postures and readings.
-
-        Sockets, planes, anchors, boards and cameras have no place, unless it was given,
-        until the first readings. Of a tracker that is far from where it was said to be
-        the base is found.
-
-        Raises:
-            ValueError: the readings fit no such arm, or that of a Pose in another base.
-        """
-        commands = as_commands(self, commands)
-        read = None if measured is None else numbers("measured", measured)
-        arm = self.standing_at(self.base_of(commands, read))
-        inputs = commands[:, self.num_joints :]
-        sensor, new = self.sensor.located(arm.nominal_tip(commands), inputs, read)
-        if sensor is self.sensor and new is None:
-            return arm
-        tool = self.tool if new is None else self.tool @ new
-        return dataclasses.replace(arm, sensor=sensor, tool=tool)
-
-    def standing_at(self, base: Array) -> Self:
-        """This arm with another base (4, 4); itself where that is its own."""
-        return self if base is self.base else dataclasses.replace(self, base=base)
-
-    def base_of(self, commands: Array, measured: Array | None) -> Array:
-        """(4, 4) where its first tracker sees the arm if far off, else the base."""
-        if measured is None:
-            return self.base
-        nominal = self.of_each_sensor(commands, self.predict(commands))
-        for (one, _, predicted), (_, _, reached) in zip(
-            nominal, self.of_each_sensor(commands, measured), strict=True
-        ):
-            if one.sensor.positions:
-                moved = _far(predicted[:, :3], reached[:, :3], self.length)
-                base = moved @ self.base
-                if not one.sensor.relative:
-                    return self.base if (moved == np.eye(4)).all() else base
-                shift = np.linalg.norm((base - self.base)[:3, 3])
-                turned = np.trace(moved[:3, :3]) < 1.0 + 2.0 * _ASIDE
-                if turned or shift > _AWAY * self.length:
-                    raise ValueError(
-                        "base is missing: with Pose, turns are relative to the "
-                        "nominal ones, so give base roughly. The positions fit "
-                        f"base={base.round(7).tolist()}; then compute the turns with "
-                        "its rotation_vectors"
-                    )
-                break
-        return self.base
-
-    def of_each_sensor(
-        self, commands: Array, measured: Array
-    ) -> Iterator[tuple[Self, Array, Array]]:
-        """The arm with each sensor of ``Several`` that read, its commands, readings."""
-        if not self.sensor.joined:
-            yield self, commands, measured
-            return
-        joints, inputs = np.split(commands, [self.num_joints], axis=1)
-        for _, one, rows, columns in self.sensor.parts(inputs):
-            read = measured[rows, : len(one.outputs)] * one.stds(self.length)
-            if len(rows):
-                yield self.measured_with(one), np.hstack([joints[rows], columns]), read
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """n names of the columns of the commands; () where the joints have none."""
-        if self.joint_names == _numbered(self.num_joints):
-            return ()
-        return (*self.joint_names, *self.sensor.inputs)
-
-    @functools.cached_property
-    def command_units(self) -> tuple[str, ...]:
-        """J units of the joints' columns, "deg" or "length"."""
-        # A column drives itself by one, its gear ratio apart.
-        at = np.abs(np.abs(self.drive) - 1.0).argmin(axis=0)
-        kinds = [self.joints[joint] for joint in at]
-        plain = self.drive[at, range(len(at))] == 1.0
-        if self.source is not None and not plain.all():
-            in_file = joints_of(self.source["text"])
-            kinds = [in_file[name].kind for name in self.joint_names]
-        return tuple("deg" if kind == "R" else "length" for kind in kinds)
 
     def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
         return self.quantities_of(self.sensor, measured_unit)
@@ -483,34 +383,6 @@ class SerialChain(Arm, Model):
             dict.fromkeys(q.unit for quantities in of_each for q in quantities)
         )
 
-    def own(self, i: int) -> slice:
-        """Where what the sensor's member ``i`` has of its own is among the p."""
-        at = self.sensor.own_of_members[i]
-        before = len(self.names) - self.waves.size - len(self.sensor.names)
-        return slice(before + at.start, before + at.stop)
-
-    @functools.cached_property
-    def names(self) -> tuple[str, ...]:
-        n = len(self.joints)
-        return (
-            *(f"{column}{i + 1}" for i in range(n) for column in COLUMNS),
-            *(f"gear{i}" for i in self.gears),
-            *(f"compliance{i}" for i in self.compliance),
-            *BASE,
-            *(f"tool {axis}" for axis in self.sensor.tool),
-            *self.sensor.names,
-            *(f"theta{i} {wave}" for i in self.harmonics for wave in WAVES),
-        )
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """p units: "length" (the table's), "deg", "ratio", "deg per torque", ..."""
-        row, mounting = ["length", "deg"] * 2 + ["deg"], ["length"] * 3 + ["deg"] * 3
-        driven = ["ratio"] * len(self.gears) + ["deg per torque"] * len(self.compliance)
-        tool, waves = [mounting[i] for i in self._tool], ["deg"] * self.waves.size
-        table = row * len(self.joints)
-        return (*table, *driven, *mounting, *tool, *self.sensor.units, *waves)
-
     def predict(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
@@ -522,20 +394,19 @@ class SerialChain(Arm, Model):
     ) -> Array:
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         columns, by_sensor = self._motion(commands, theta, self._steps_of_parameters)
-        first = 5 * len(self.joints)
-        last = first + len(self.gears)
+        at, own = self._at, self._at["sensor"].start
+        slopes = [columns[..., :own], by_sensor, columns[..., own:]]
+        result = np.concatenate(slopes, axis=-1)
         swing, goes = self._swing(commands, theta)
         if self.gears:
-            at = [i - 1 for i in self.gears]
-            moves = self._moves(commands)[:, at] * goes[at].T
-            columns[..., first:last] *= moves[:, None]
+            joints = [i - 1 for i in self.gears]
+            moves = self._moves(commands)[:, joints] * goes[joints].T
+            result[..., at["gears"]] *= moves[:, None]
         if self.compliance:
-            torque = self._torque(commands).T
-            columns[..., last : last + len(self.compliance)] *= torque[:, None]
-        end = columns.shape[-1] - self.waves.size
-        columns, waves = np.split(columns, [end], axis=-1)
-        waves *= swing.reshape(self.waves.size, len(commands)).T[:, None]
-        return np.concatenate([columns, by_sensor, waves], axis=-1)
+            result[..., at["compliance"]] *= self._torque(commands).T[:, None]
+        waves = swing.reshape(self.waves.size, len(commands)).T
+        result[..., at["harmonics"]] *= waves[:, None]
+        return result
 
     def command_jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
@@ -557,47 +428,14 @@ class SerialChain(Arm, Model):
         return self.sensor.wrapped(off, commands[:, self.num_joints :], self.length)
 
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
-        parameters = as_parameters(self, parameters)
-        of_sensor = self._split(parameters)[2]
-        off, rows = self.sensor.facts(of_sensor)
-        last = len(parameters) - self.waves.size
-        slopes = np.zeros((len(off), len(parameters)))
-        slopes[:, last - len(of_sensor) : last] = rows
+        theta, at = as_parameters(self, parameters), self._at["sensor"]
+        off, rows = self.sensor.facts(theta[at])
+        slopes = np.zeros((len(off), len(theta)))
+        slopes[:, at] = rows
         return off, slopes
 
     def default_noise(self) -> Noise:
         return Noise(std=self.sensor.stds(self.length or 1.0))
-
-    def noise_with_play(self, play: ArrayLike) -> Noise:
-        """The sensor's noise plus the backlash of the joints, for ``identify`` and
-        ``select``.
-
-        Args:
-            play: total width of the backlash in degrees (or units of length): one
-                number or (J,); about 0.3 for hobby servos. A joint is off by it over
-                the square root of 12.
-        """
-        width = np.broadcast_to(numbers("play", play), (self.num_joints,))
-        if not (width >= 0.0).all():
-            raise ValueError(f"play must not be negative, got {width.min():g}")
-        by_inputs = np.zeros(len(self.sensor.inputs))
-        spread = np.concatenate([width / np.sqrt(12.0), by_inputs])
-        return dataclasses.replace(self.default_noise(), command_std=spread)
-
-    def from_one_side(self, commands: ArrayLike, by: float) -> Array:
-        """Joints (N, J) at which to start each move, so that all arrive from below.
-
-        The backlash is then an error of the joint's zero, not of each reading.
-
-        Args:
-            commands: (N, n) postures.
-            by: degrees (or units of length) below, more than the play; less where a
-                joint's limit is nearer.
-        """
-        if not numbers("by", by) > 0.0:
-            raise ValueError(f"by must be positive, got {by:g}")
-        joints = as_commands(self, commands)[:, : self.num_joints]
-        return np.maximum(joints - by, np.minimum(self.limits[:, 0], joints))
 
     def default_prior(self) -> Prior:
         """Loose knowledge of any arm, by the length of its links; see the constants.
@@ -634,9 +472,8 @@ class SerialChain(Arm, Model):
     def error_groups(self) -> ErrorGroups:
         """Lengths, turns of the axes, zeros of the joints, compliance, harmonics."""
         members = np.full(len(self.names), -1)
-        members[: self.table.size].reshape(-1, 5)[:] = [0, 1, 0, 2, 1]
-        members[np.flatnonzero(np.array(self.units) == "deg per torque")] = 3
-        members[len(members) - self.waves.size :] = 4
+        members[self._at["table"]] = np.tile([0, 1, 0, 2, 1], len(self.joints))
+        members[self._at["compliance"]], members[self._at["harmonics"]] = 3, 4
         return ErrorGroups(members, np.array(_SIZES), np.array(_SIZES_SPREAD))
 
     @property
@@ -687,27 +524,9 @@ class SerialChain(Arm, Model):
         return {"kind": "serial_chain", **data, **rest}
 
 
-def _far(points: Array, measured: Array, length: float) -> Array:
-    """(4, 4) that takes nominal points (N, 3) to those measured, if those are far off
-    and it explains them; else one."""
-    moved, off = np.eye(4), np.linalg.norm(measured - points, axis=1)
-    if len(points) < 4 or np.median(off) < _NEAR * length:
-        return moved
-    middle, there = points.mean(axis=0), measured.mean(axis=0)
-    turn = Rotation.align_vectors(measured - there, points - middle)[0].as_matrix()
-    moved[:3, :3], moved[:3, 3] = turn, there - turn @ middle
-    errors = np.linalg.norm(points @ turn.T + moved[:3, 3] - measured, axis=1)
-    return moved if np.median(errors) < _ALIKE * length else np.eye(4)
-
-
 def turning(joints: str) -> list[int]:
     """Joints that turn, counted from 1."""
     return [i + 1 for i, kind in enumerate(joints) if kind == "R"]
-
-
-def _numbered(columns: int) -> tuple[str, ...]:
-    """Names of joints that have none."""
-    return tuple(f"joint {i + 1}" for i in range(columns))
 
 
 def _usual_loads(n: int, tool: Array) -> tuple[Load, ...]:

@@ -5,23 +5,22 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import itertools
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.csgraph import connected_components
 
-from jaxcal.arms.chain import COLUMNS, WAVES, SerialChain
-from jaxcal.arms.findings import CLEAR_UP, Part, other_distances
-from jaxcal.arms.plausible import require_places, require_readings, require_touched
-from jaxcal.arms.sensors import Sensor, Tip
+from jaxcal.arms.arm import COLUMNS, WAVES
+from jaxcal.arms.chain import SerialChain
+from jaxcal.arms.sensors import Sensor
 from jaxcal.arms.sensors.sensor import BASE, Readings, label
 from jaxcal.arms.sensors.several import OneTable, stacked
-from jaxcal.calibration import verdict as models
 from jaxcal.checks import Array, one_of
 from jaxcal.files import write_over
+from jaxcal.late import late
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise, Prior
 
@@ -49,6 +48,10 @@ class Chains(Model):
         stands: of each chain the numbers of its sensor's members (itself, but of
             ``Several``), equal where two chains have one object.
     """
+
+    # Of modules that know this one.
+    prepared = late("jaxcal.arms.located:prepared_chains")
+    verdict = late("jaxcal.arms.verdict:verdict_of_chains")
 
     tips: tuple[str, ...]
     chains: tuple[SerialChain, ...]
@@ -155,22 +158,18 @@ class Chains(Model):
         return [owners[number] for number in sorted(owners)]
 
     @functools.cached_property
-    def _cells(self) -> list[list[int]]:
-        """Chains that show where each other stands: by joints or things they share."""
-        cells: list[list[int]] = [[k] for k in range(len(self.chains))]
-        linked = [
-            {k for k, _ in owners}
-            for owners in self._members
-            for k, i in owners[:1]
-            if self.chains[k].sensor.members[i].stands
-        ]
-        pairs = itertools.combinations(range(len(self.chains)), 2)
-        linked += [{k, j} for k, j in pairs if _common(self.chains[k], self.chains[j])]
-        for link in linked:
-            joined = [cell for cell in cells if link & set(cell)]
-            cells = [cell for cell in cells if cell not in joined]
-            cells.append(sorted(itertools.chain(*joined)))
-        return cells
+    def _cells(self) -> NDArray[np.int32]:
+        """(C,) equal for chains that show where each other stands: by joints or things
+        that they share."""
+        linked = np.array(
+            [[_common(one, other) > 0 for other in self.chains] for one in self.chains]
+        )
+        for owners in self._members:
+            k, i = owners[0]
+            if self.chains[k].sensor.members[i].stands:
+                numbers = [number for number, _ in owners]
+                linked[np.ix_(numbers, numbers)] = True
+        return np.asarray(connected_components(linked)[1])
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
@@ -334,12 +333,14 @@ class Chains(Model):
         """
         priors = [arm.default_prior() for arm in self.chains]
         fixed = [set(prior.fixed) for prior in priors]
-        for cell in self._cells:
-            unseen_of_base = set(BASE).intersection(*(fixed[k] for k in cell))
-            for k in cell:
-                fixed[k] -= set(BASE)
-                if k == cell[0] or _common(self.chains[cell[0]], self.chains[k]):
-                    fixed[k] |= unseen_of_base
+        unseen_of_base = [set(BASE) & names for names in fixed]
+        for k, cell in enumerate(self._cells):
+            first, *_ = cell_mates = np.flatnonzero(self._cells == cell)
+            fixed[k] -= set(BASE)
+            if k == first or _common(self.chains[first], self.chains[k]):
+                fixed[k] |= set(BASE).intersection(
+                    *(unseen_of_base[mate] for mate in cell_mates)
+                )
         observed = {
             name
             for arm, named, of_arm in zip(self.chains, self._named, fixed, strict=True)
@@ -416,30 +417,6 @@ class Chains(Model):
             with self._naming(k):
                 arm.require_commands(arm_commands)
 
-    def prepared(self, commands: Array, measured: Array | None = None) -> Self:
-        """These chains with their sensors where commands (and readings) put them.
-
-        Raises:
-            ValueError: as of an arm; no chain touches a socket whose distance is given.
-        """
-        tables = []
-        for k, arm, rows, arm_commands in self._parts(commands):
-            read = None
-            if measured is not None:
-                read = measured[rows, : arm.num_outputs] * self._scale(k)
-            tables.append((k, arm_commands, read))
-            with self._naming(k):
-                require_readings(self.chains[k], arm_commands, read)
-        arms = self._located(tables)
-        if measured is not None:
-            for readings in self._by_member(arms, tables).values():
-                columns = [of_chain.columns for of_chain in readings]
-                require_touched(readings[0].sensor, np.vstack(columns))
-        for k, arm_commands, read in tables:
-            with self._naming(k):
-                require_places(arms[k], arm_commands, read)
-        return dataclasses.replace(self, chains=tuple(arms))
-
     @contextlib.contextmanager
     def _naming(self, k: int) -> Iterator[None]:
         """The chain's name before what is refused of it."""
@@ -448,44 +425,14 @@ class Chains(Model):
         except ValueError as error:
             raise ValueError(f"{self.tips[k]}: {error}") from None
 
-    def _located(
-        self, tables: Sequence[tuple[int, Array, Array | None]]
-    ) -> list[SerialChain]:
-        """The chains, what they share where the one that reads it most has it."""
-        arms = list(self.chains)
-        bases: dict[int, Array] = {}  # by the first chain that stands there
-        for k, arm_commands, read in tables:
-            base = arms[k].base_of(arm_commands, read)
-            if base is not arms[k].base:
-                bases.setdefault(self._stands_as(k), base)
-        for k, arm in enumerate(arms):
-            arms[k] = arm.standing_at(bases.get(self._stands_as(k), arm.base))
-        placed = {}
-        for number, of_chains in self._by_member(arms, tables).items():
-            readings = [one for one in of_chains if len(one.columns)]
-            shared = len(self._members[number]) > 1
-            if shared and readings and readings[0].sensor.stands:
-                one = _placed(readings)
-                if one is not readings[0].sensor:  # where it was not given
-                    placed[number] = one
-        for k, arm_commands, read in tables:
-            standing = {number: one.standing for number, one in placed.items()}
-            arms[k] = self._with(standing, arms[k], k)
-            with self._naming(k):
-                arms[k] = arms[k].located(arm_commands, read)
-            first = self._stands_as(k)
-            if not np.array_equal(arms[k].base, arms[first].base):
-                raise ValueError(
-                    f"chains {self.tips[first]} and {self.tips[k]} share their base, "
-                    "but their positions are in different frames: give both in one "
-                    "frame, such as that of a tracker that stands still"
-                )
-        return [self._with(placed, arm, k) for k, arm in enumerate(arms)]
-
-    def _stands_as(self, k: int) -> int:
-        """The first chain that has this one's base."""
+    @functools.cached_property
+    def _firsts(self) -> list[int]:
+        """Of each chain the first one that has its base."""
         arms = self.chains
-        return next(j for j in range(k + 1) if j == k or _common(arms[j], arms[k]))
+        return [
+            next(j for j in range(k + 1) if j == k or _common(arms[j], arms[k]))
+            for k in range(len(arms))
+        ]
 
     def _with(
         self, placed: Mapping[int, Sensor], arm: SerialChain, k: int
@@ -507,9 +454,7 @@ class Chains(Model):
         """What each chain read of a sensor, by its number."""
         by_member: dict[int, list[Readings]] = {}
         for k, commands, measured in tables:
-            arm = arms[k]
-            tip, inputs = arm.nominal_tip(commands), commands[:, arm.num_joints :]
-            of_members = arm.sensor.of_members(tip, inputs, measured)
+            of_members = arms[k].readings(commands, measured)
             for number, readings in zip(self.stands[k], of_members, strict=True):
                 by_member.setdefault(number, []).append(readings)
         return by_member
@@ -581,47 +526,6 @@ class Chains(Model):
         chains = [self._with({number: sensor}, a, k) for k, a in enumerate(self.chains)]
         return dataclasses.replace(self, chains=tuple(chains))
 
-    def _shared_parts(self, fit: Any) -> list[Any]:
-        """What chains read of the sensors that they share, of all rows that are used;
-        distances that one chain's contacts judge are left to its own verdict."""
-        used = np.flatnonzero(fit.loss_weights > 0.0)
-        tables = [(k, at, None) for k, _, _, at in self._parts(fit.commands[used])]
-        parts = []
-        for number, readings in self._by_member(self.chains, tables).items():
-            if len(readings) < 2:
-                continue
-            k, i = self._members[number][0]
-            sensor, own = readings[0].sensor, self.members[k][self.chains[k].own(i)]
-            columns = np.vstack([of_chain.columns for of_chain in readings])
-            points = np.vstack([of_chain.tip.position for of_chain in readings])
-            where = (used, columns, points, own, readings[0].scale)
-            part = Part(number, sensor, sensor.kind, "", *where)
-            alone = [part._replace(columns=r.columns).touched() for r in readings]
-            parts.append(part._replace(judged=np.any(alone, axis=0)))
-        return parts
-
-    def verdict(self, fit: Any) -> ChainsVerdict:
-        """Good where every chain that was read is, and distances that they share."""
-        used = fit.commands[fit.loss_weights > 0.0]
-        read = {self.tips[k] for k, *_ in self._parts(used)}
-        of_chains = {tip: fit.of(tip).verdict for tip in self.tips if tip in read}
-        bad = [tip for tip, told in of_chains.items() if not told.good]
-        step = f"{bad[0]}: {of_chains[bad[0]].next_step}" if bad else models.USE
-        apart: list[str] = []
-        wrong = False
-        if fit.noise_std is None:
-            step = "measure more postures, or state noise_std=1 (in units of noise)"
-        else:
-            length = min(arm.length for arm in self.chains)
-            apart, wrong = other_distances(fit, self._shared_parts(fit), length)
-            step = CLEAR_UP if wrong else step
-        reasons = [
-            f"{tip}: {line}" for tip, told in of_chains.items() for line in told.lines()
-        ]
-        reasons += [f"{tip}: no reading" for tip in self.tips if tip not in read]
-        good = not (bad or wrong)
-        return ChainsVerdict(good, (*reasons, *apart), step, "", of_chains)
-
     def calibrated(self, parameters: ArrayLike) -> Self:
         """The chains whose nominal is this one with ``parameters``."""
         theta = as_parameters(self, parameters)
@@ -667,18 +571,6 @@ class Chains(Model):
         return cls(tuple(tips), tuple(arms), tuple(map(tuple, stands)))
 
 
-@dataclasses.dataclass(frozen=True)
-class ChainsVerdict(models.Verdict):
-    """What the readings say of each chain."""
-
-    of_chains: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-
-    @property
-    def held_out(self) -> float:
-        """Mean held-out error of the chains, each in its unit."""
-        return float(np.mean([told.held_out for told in self.of_chains.values()]))
-
-
 def _common(one: SerialChain, other: SerialChain) -> int:
     """Leading joints that two chains have in common."""
     stands = np.allclose(one.base, other.base, atol=_SAME)
@@ -707,21 +599,3 @@ def _numbered(members: Sequence[Sequence[Sensor]]) -> tuple[tuple[int, ...], ...
         keys = [(id(one), of_chain[:i].count(one)) for i, one in enumerate(of_chain)]
         stands.append(tuple(numbers.setdefault(key, len(numbers)) for key in keys))
     return tuple(stands)
-
-
-def _placed(readings: Sequence[Readings]) -> Sensor:
-    """A sensor with each thing where the arm that reads it most has it."""
-    sensor = readings[0].sensor
-    which = [sensor.of_rows(of_arm.columns) for of_arm in readings]
-    count = 1 + max(int(rows.max()) for rows in which)
-    most = np.argmax([np.bincount(rows, minlength=count) for rows in which], axis=0)
-    kept = [
-        of_arm.at(np.flatnonzero(most[rows] == i))
-        for i, (of_arm, rows) in enumerate(zip(readings, which, strict=True))
-    ]
-    measured = [of_arm.measured for of_arm in kept if of_arm.measured is not None]
-    return sensor.located(
-        Tip.together([of_arm.tip for of_arm in kept]),
-        np.vstack([of_arm.columns for of_arm in kept]),
-        np.vstack(measured) if measured else None,
-    )[0]

@@ -11,12 +11,14 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.chain import turning
 from jaxcal.calibration.verdict import left_out
-from jaxcal.checks import Array
-from jaxcal.models.uncertainty import Prior
+from jaxcal.checks import Array, numbers
+from jaxcal.models.model import as_commands
+from jaxcal.models.uncertainty import Noise, Prior
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration
@@ -181,6 +183,39 @@ def play_in_words(fit: Fit) -> list[str]:
         "Approaching always from one side (arm.from_one_side) would reduce the scatter "
         f"by {1.0 - left:.0%}."
     ]
+
+
+def noise_with_play(arm: Chain, play: ArrayLike) -> Noise:
+    """The sensor's noise plus the backlash of the joints, for ``identify`` and
+    ``select``.
+
+    Args:
+        play: total width of the backlash in degrees (or units of length): one
+            number or (J,); about 0.3 for hobby servos. A joint is off by it over
+            the square root of 12.
+    """
+    width = np.broadcast_to(numbers("play", play), (arm.num_joints,))
+    if not (width >= 0.0).all():
+        raise ValueError(f"play must not be negative, got {width.min():g}")
+    by_inputs = np.zeros(len(arm.sensor.inputs))
+    spread = np.concatenate([width / np.sqrt(12.0), by_inputs])
+    return dataclasses.replace(arm.default_noise(), command_std=spread)
+
+
+def from_one_side(arm: Chain, commands: ArrayLike, by: float) -> Array:
+    """Joints (N, J) at which to start each move, so that all arrive from below.
+
+    The backlash is then an error of the joint's zero, not of each reading.
+
+    Args:
+        commands: (N, n) postures.
+        by: degrees (or units of length) below, more than the play; less where a
+            joint's limit is nearer.
+    """
+    if not numbers("by", by) > 0.0:
+        raise ValueError(f"by must be positive, got {by:g}")
+    joints = as_commands(arm, commands)[:, : arm.num_joints]
+    return np.maximum(joints - by, np.minimum(arm.limits[:, 0], joints))
 
 
 def unexplained(model: Chain, fit: Fit, rows: Array) -> Array:

@@ -66,9 +66,8 @@ class Part(NamedTuple):
 def parts_of(fit: Fit, used: NDArray[np.intp]) -> list[Part]:
     """Readings of each sensor that has some."""
     model, commands = fit.model, fit.commands[used]
-    tip, inputs = model.nominal_tip(commands), commands[:, model.num_joints :]
     kinds, parts = [one.kind for one in model.sensor.members], []
-    for i, read in enumerate(model.sensor.of_members(tip, inputs, None)):
+    for i, read in enumerate(model.readings(commands, None)):
         twice = kinds.count(read.sensor.kind) > 1
         kind = f"sensor {i}'s {read.sensor.kind}" if twice else read.sensor.kind
         if len(read.rows):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import warnings
+from typing import cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.chain import SerialChain as Chain
-from jaxcal.arms.sensors import Board, Sensor, Socket
+from jaxcal.arms.sensors import Board, Sensor, Socket, Tip
+from jaxcal.arms.sensors.sensor import Readings
 from jaxcal.arms.views import seen_by
 from jaxcal.checks import Array, in_words
 
@@ -26,28 +28,12 @@ _EXPLAINED = 0.2  # of the errors as given: what is left when the mistake is und
 _OTHER_UNIT = 0.01  # of it: so far off and tenfold, a distance is in another unit
 
 
-def prepared(arm: Chain, commands: Array, measured: Array | None = None) -> Chain:
-    """The arm with its sensor where commands (and readings) put it.
-
-    Raises:
-        ValueError: readings in another unit, of another arm or place, radians for
-            degrees, joints beyond their limits.
-    """
-    require_readings(arm, commands, measured)
-    arm = arm.located(commands, measured)
-    if measured is not None:
-        tip, inputs = arm.nominal_tip(commands), commands[:, arm.num_joints :]
-        for part in arm.sensor.of_members(tip, inputs, measured):
-            require_touched(part.sensor, part.columns)
-    require_places(arm, commands, measured)
-    return arm
-
-
 def require_readings(arm: Chain, commands: Array, measured: Array | None) -> None:
     """Refuse what no arm like this one takes or gives; None, candidates."""
     if measured is not None:
-        for part in arm.of_each_sensor(commands, measured):
-            _require_of_sensor(*part)
+        for part in arm.readings(commands, measured):
+            if len(part.rows):
+                _require_part(part, commands[part.rows, : arm.num_joints])
     arm.require_commands(commands)
     if measured is None:
         _warn_of_radians(arm, commands)
@@ -58,8 +44,9 @@ def require_places(arm: Chain, commands: Array, measured: Array | None) -> None:
     if measured is None:
         _warn_of_picture(arm, commands)
         return
-    for part in arm.of_each_sensor(commands, measured):
-        _require_sockets(*part)
+    for part in arm.readings(commands, measured):
+        if isinstance(part.sensor, Socket) and len(part.rows):
+            _require_sockets(arm, part, commands[part.rows, : arm.num_joints])
 
 
 def require_commands(arm: Chain, commands: Array) -> None:
@@ -114,24 +101,24 @@ def _within(column: Array, least: float, most: float) -> bool:
     return bool(((column >= least) & (column <= most)).all())
 
 
-def _require_of_sensor(arm: Chain, commands: Array, measured: Array) -> None:
-    """Refuse millimetres for metres, radians for degrees (no arm is off tenfold), and a
-    board's corners outside of the picture."""
-    joints = commands[:, : arm.num_joints]
+def _require_part(part: Readings, joints: Array) -> None:
+    """Refuse millimetres for metres, radians for degrees (no arm is off tenfold), a
+    turned tool frame, and a board's corners outside of the picture."""
     if len(joints) > 2 and (joints == joints[0]).all():
         raise ValueError(
             f"the joints are the same in all {len(joints)} rows: were they recorded?"
         )
-    if arm.sensor.relative:
-        _require_tool(arm, commands, measured)
-    if isinstance(arm.sensor, Board):
-        _require_in_picture(arm.sensor, measured, arm.length or 1.0)
-    if not arm.sensor.positions:
+    measured, length = np.asarray(part.measured), part.tip.length
+    if part.sensor.relative:
+        _require_tool(part.tip, measured)
+    if isinstance(part.sensor, Board):
+        _require_in_picture(part.sensor, measured, length or 1.0)
+    if not part.sensor.positions:
         return
-    points = np.array([measured[:, :3], arm.predict(commands)[:, :3]])
+    points = np.array([measured[:, :3], part.tip.position])
     apart = points - np.median(points, axis=1, keepdims=True)
     spread = np.median(np.linalg.norm(apart, axis=2), axis=1)
-    if max(spread) > max(10.0 * min(spread), 0.01 * arm.length):
+    if max(spread) > max(10.0 * min(spread), 0.01 * length):
         raise ValueError(
             "measured must be in the model's unit of length and commands in degrees: "
             f"measured positions spread over {spread[0]:g}, predicted ones over "
@@ -139,13 +126,12 @@ def _require_of_sensor(arm: Chain, commands: Array, measured: Array) -> None:
         )
 
 
-def _require_tool(arm: Chain, commands: Array, poses: Array) -> None:
+def _require_tool(tip: Tip, poses: Array) -> None:
     """Refuse a tool frame that is turned on the flange, which no fit finds."""
-    nominal = arm.rotations(commands, np.zeros((len(commands), 3)))
-    read = arm.rotations(commands, poses[:, 3:])
-    on_tool = np.matrix_transpose(nominal) @ read
-    turn, apart = _mean_turn(on_tool)
-    of_base = _mean_turn(read @ np.matrix_transpose(nominal))[1]
+    nominal = tip.nominal()
+    turns = Rotation.from_rotvec(poses[:, 3:], degrees=True).as_matrix()
+    turn, apart = _mean_turn(np.matrix_transpose(nominal) @ turns @ nominal)
+    of_base = _mean_turn(turns)[1]
     angle = float(np.linalg.norm(turn))
     if angle > _TURNED and apart < min(angle, of_base) / 3.0:
         raise ValueError(
@@ -201,12 +187,10 @@ def _warn_of_picture(arm: Chain, candidates: Array) -> None:
         )
 
 
-def _require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
+def _require_sockets(arm: Chain, part: Readings, joints: Array) -> None:
     """Refuse contacts that no arm near the nominal one can have made."""
-    if not isinstance(arm.sensor, Socket):
-        return
-    which = arm.sensor.of_rows(commands[:, arm.num_joints :])
-    joints = commands[:, : arm.num_joints]
+    sensor, measured = cast(Socket, part.sensor), np.asarray(part.measured)
+    which = sensor.of_rows(part.columns)
     _, first, groups = np.unique(joints, axis=0, return_index=True, return_inverse=True)
     for row in np.flatnonzero(which != which[first][groups.ravel()])[:1]:
         raise ValueError(
@@ -216,7 +200,7 @@ def _require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
         )
     if measured.any():  # offsets that were measured, as in a simulation, are of any tip
         return
-    points = arm.nominal_tips(joints)
+    points = part.tip.position
     most, middles = _NOMINAL * arm.length, {}
     constant = np.flatnonzero((joints == joints[0]).all(axis=0))
     still = ", ".join(arm.joint_names[i] for i in constant)
@@ -226,10 +210,12 @@ def _require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
         middles[i] = np.median(points[rows], axis=0)
         far = np.linalg.norm(points[rows] - middles[i], axis=1)
         if len(rows) > 2 and np.median(far) > most:
+            touching, commands = arm.measured_with(sensor), [joints, part.columns]
+            columns = mistaken_columns(touching, np.hstack(commands), measured)
             raise ValueError(
                 f"contacts of socket {i} must be at one point within {most:.2g}, but "
                 f"with the nominal arm they scatter by {np.median(far):.2g}: "
-                + (still or mistaken_columns(arm, commands, measured) or _OTHER_ARM)
+                + (still or columns or _OTHER_ARM)
             )
         lost = rows[far > most + 4.0 * np.median(far)]
         if lost.size:
@@ -238,7 +224,7 @@ def _require_sockets(arm: Chain, commands: Array, measured: Array) -> None:
                 f"rows {in_words(lost)} are {far.max():.2g} from the others: rows of "
                 "another place?"
             )
-    for one, other, distance, _ in arm.sensor.distances:
+    for one, other, distance, _ in sensor.distances:
         if not {int(one), int(other)} <= middles.keys():  # another arm's
             continue
         distance_seen = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
@@ -326,8 +312,7 @@ def _error(arm: Chain, commands: Array, measured: Array) -> float:
     except ValueError:  # no such arm
         return np.inf
     off = measured - at.predict(commands)
-    tip, inputs = at.nominal_tip(commands), commands[:, at.num_joints :]
-    for part in at.sensor.of_members(tip, inputs, off):
+    for part in at.readings(commands, off):
         if part.sensor.num_places:  # its place is no merit of the arm
             which = part.sensor.of_rows(part.columns)
             for i in np.unique(which):

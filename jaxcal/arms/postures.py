@@ -22,92 +22,6 @@ _VAIN = 8  # batches in which nothing is found: there is nothing
 _REACHED = 1e-7  # of the arm's length
 _APART = 2.0  # degrees (of a slide: percent of its stroke) between two postures
 _SUNK = 0.01  # of the arm's length: a socket let into a table is no deeper
-_THICK = 0.04  # radius of an arm's links by its length
-
-
-@dataclasses.dataclass(frozen=True)
-class Room:
-    """Where an arm may be: simple, spheres along straight lines between its joints."""
-
-    floor: float | None  # height that no joint behind the first is below
-    approach: Array | None  # (4,) direction in which the tool comes, degrees about it
-    planes: Array  # (P, 4) normal, offset: spheres stay where normal . x > offset
-    boxes: Array  # (B, 6) least x, y, z, then greatest: spheres stay outside
-    radius: float | None  # of the spheres
-
-    def reasons(self, arm: Chain, commands: Array) -> Array:
-        """(N,) why a posture is not possible, "" where it is."""
-        points = arm.skeleton(commands)
-        why = np.full(len(points), "", dtype=object)
-        if len(self.planes) or len(self.boxes):
-            why[self._touches(arm, points)] = "are not clear"
-        if self.approach is not None:
-            way = points[:, -1] - points[:, -2]
-            size = np.linalg.norm(way, axis=1, keepdims=True)
-            axis = arm.nominal_tip(commands).rotation[:, :, 2]
-            far = size > 0.01 * (arm.length or 1.0)
-            way = np.where(far, way / (size + 1e-300), axis)
-            least = np.cos(np.radians(self.approach[3]))
-            why[way @ self.approach[:3] < least] = "approach from another direction"
-        if self.floor is not None:
-            why[(points[:, 2:-1, 2] < self.floor).any(axis=1)] = "are below the floor"
-        return why
-
-    def _touches(self, arm: Chain, points: Array) -> Array:
-        """(N,) whether a sphere on a link, but the first and the tip's, touches."""
-        radius = self.radius or _THICK * arm.length
-        steps = max(2, int(np.ceil(arm.length / max(radius, 1e-9) / 4.0)))
-        share = np.linspace(0.0, 1.0, steps)[:, None]
-        starts, ways = points[:, 2:-1, None], np.diff(points[:, 2:], axis=1)[:, :, None]
-        ways[:, -1] *= 0.7  # the tip's end touches
-        balls = (starts + share * ways).reshape(len(points), -1, 3)
-        near = np.zeros(balls.shape[:2], dtype=bool)
-        for plane in self.planes:
-            near |= balls @ plane[:3] - plane[3] < radius
-        for box in self.boxes:
-            outside = np.maximum(box[:3] - balls, balls - box[3:]).clip(0.0)
-            near |= np.linalg.norm(outside, axis=-1) < radius
-        return np.asarray(near.any(axis=1))
-
-
-def _room_of(
-    floor: float | None = None,
-    approach: ArrayLike | None = None,
-    clear: Sequence[ArrayLike] = (),
-    radius: float | None = None,
-) -> Room | None:
-    """Checked; the cone of an approach without its angle is 60 degrees."""
-    if radius is not None and not len(clear):
-        raise ValueError(f"radius needs clear= (planes or boxes), got {radius}")
-    floor = None if floor is None else float(numbers("floor", floor))
-    if radius is not None and not numbers("radius", radius) > 0.0:
-        raise ValueError(f"radius must be positive, got {radius}")
-    if floor is None and approach is None and not len(clear):
-        return None
-    cone = None
-    if approach is not None:
-        cone = numbers("approach", approach)
-        cone = np.append(cone, 60.0) if cone.shape == (3,) else cone
-        size = np.linalg.norm(cone[:3])
-        if cone.shape != (4,) or not (size > 0.0 and 0.0 < cone[3] <= 180.0):
-            raise ValueError(
-                "approach must be a direction (x, y, z) and the largest angle from it "
-                f"in degrees, got {in_words(numbers('approach', approach))}"
-            )
-        cone = np.append(cone[:3] / size, cone[3])
-    things: dict[int, list[Array]] = {4: [], 6: []}
-    for one in clear:
-        row = numbers("clear", one)
-        if row.shape not in ((4,), (6,)):
-            raise ValueError(
-                "clear must hold planes (normal, offset) of 4 numbers and boxes (least "
-                f"x, y, z, greatest) of 6, got {in_words(row)}"
-            )
-        things[len(row)].append(row)
-    for row in things[4]:
-        row /= np.linalg.norm(row[:3])
-    planes, boxes = (np.array(rows).reshape(-1, n) for n, rows in things.items())
-    return Room(floor, cone, planes, boxes, radius)
 
 
 def postures(arm: Chain, count: int, *, seed: int = 0, **rules: Any) -> Array:
@@ -132,17 +46,10 @@ def postures(arm: Chain, count: int, *, seed: int = 0, **rules: Any) -> Array:
             the board fills 25 to 80 % of the picture.
         tilt: degrees that the board's face may be turned from the camera, by default
             45.
-        side: "+z", the printed side is where the board's z axis points, or "-z"; by
-            default as views showed it, else either.
         floor: lowest height (z in the measuring frame) of joints, and of sockets within
             1 % of the arm's length.
         approach: direction (x, y, z) of the tool's approach, from the last joint to the
             tip, and the largest angle from it in degrees (60).
-        clear: planes (normal, offset) whose other side, and boxes (least x, y, z,
-            greatest), that the arm does not touch: spheres along straight lines between
-            the joints. The first link, the tip and the arm against itself are not
-            looked at.
-        radius: of these spheres; by default 4 % of the arm's length.
 
     Returns:
         (count, n) commands with the sensor's columns, in an order of little travel.
@@ -188,32 +95,23 @@ class ReachableSet:
         camera: ArrayLike | None = None,
         distance: Sequence[float] | None = None,
         tilt: float | None = None,
-        side: str | None = None,
-        **room: Any,
+        floor: float | None = None,
+        approach: ArrayLike | None = None,
     ) -> None:
         if camera is None and getattr(arm.sensor, "picture", None) is not None:
             camera = arm.sensor.camera  # type: ignore[attr-defined]  # of a Board
-        self.view = view_of(arm, camera, distance, tilt, side)
-        self.room = _room_of(**room)
+        self.view = view_of(arm, camera, distance, tilt)
+        self.floor = -np.inf if floor is None else float(numbers("floor", floor))
+        self.cone = None if approach is None else _cone(approach)
         if arm.sensor.joined:
             raise ValueError("use one sensor at a time: arm.measured_with(sensor)")
         self.near, self.allowed = near, allowed
         self.arm, self.targets = _aimed(arm, near)
-        places = getattr(self.arm.sensor, "places", None)
-        floor = self.room.floor if self.room else None
-        if floor is not None and isinstance(arm.sensor, Socket) and places is not None:
-            for i in np.flatnonzero(places[:, 2] < floor - _SUNK * arm.length)[:1]:
-                raise ValueError(
-                    f"socket {i} at {in_words(places[i])} is below floor = {floor:g}: "
-                    "is the floor's height given in the frame of the base?"
-                )
         self.turning = np.array(self.arm.command_units) == "deg"
-
-    @property
-    def limits(self) -> Array:
-        """(J, 2) of the joints, 180 degrees where there are none."""
         limits = self.arm.limits
-        return np.where(self.turning[:, None], limits.clip(-180.0, 180.0), limits)
+        self.limits = np.where(
+            self.turning[:, None], limits.clip(-180.0, 180.0), limits
+        )
 
     def __call__(self, command: Array) -> bool:
         """Whether the arm can be measured at a command (n,)."""
@@ -254,105 +152,128 @@ class ReachableSet:
             why = "cannot reach it within the limits"
             reasons = ["" if one else why for one in reached]
         elif self.targets is not None:
-            points = arm.nominal_tips(commands)
+            points = arm.nominal_tip(commands).position
             far = np.linalg.norm(points[:, None] - self.targets[:, :3], axis=-1)
             close = (far <= self.targets[:, 3]).any(axis=1)
             reasons = ["" if one else "are not near" for one in close]
-        if self.room is not None:
-            beside = self.room.reasons(arm, commands)
-            reasons = [a or b for a, b in zip(reasons, beside, strict=True)]
+        if self.floor > -np.inf or self.cone is not None:
+            stands = self._stands(commands)
+            reasons = [a or b for a, b in zip(reasons, stands, strict=True)]
         return commands, reasons
+
+    def _stands(self, commands: Array) -> Array:
+        """(N,) why the arm may not stand at a posture, "" where it may."""
+        arm, points = self.arm, self.arm.skeleton(commands)
+        why = np.full(len(points), "", dtype=object)
+        if self.cone is not None:
+            way = points[:, -1] - points[:, -2]
+            size = np.linalg.norm(way, axis=1, keepdims=True)
+            axis = arm.nominal_tip(commands).rotation[:, :, 2]
+            far = size > 0.01 * (arm.length or 1.0)
+            way = np.where(far, way / (size + 1e-300), axis)
+            least = np.cos(np.radians(self.cone[3]))
+            why[way @ self.cone[:3] < least] = "approach from another direction"
+        points[:, -1, 2] += _SUNK * arm.length
+        last = len(points[0]) - (not isinstance(arm.sensor, Socket))
+        why[(points[:, 2:last, 2] < self.floor).any(axis=1)] = "are below the floor"
+        return why
 
     def drawn(self, count: int, seed: int) -> Array:
         """(count, n) commands from random starts, in an order of little travel."""
         whole_number("count", count, 1)
         if not np.isfinite(self.limits).all():
             raise ValueError("limits=... is missing: the limits of sliding joints")
-        rng = np.random.default_rng(seed)
-        collection = _Collection(self, count)
-        for batch in range(_ROUNDS):
-            if batch == _VAIN and not collection.reached.all():
-                break
-            commands, places = collection.starts(rng)
-            for one in zip(*self.reach(commands, rng), places, strict=True):
-                collection.add(*one)
-            if len(collection.kept) == count and collection.reached.all():
-                return collection.kept[in_turn(self.arm, collection.kept)]
-        raise ValueError(collection.shortfall())
-
-
-class _Collection:
-    """Postures that can be measured, and what became of the others that were tried."""
-
-    def __init__(self, where: ReachableSet, count: int) -> None:
-        self.where, self.arm, self.count = where, where.arm, count
-        self.low, self.high = where.limits.T
+        arm, rng = self.arm, np.random.default_rng(seed)
+        low, high = self.limits.T
         # (J,) two of these are as far as postures must be apart.
-        self.unit = np.where(where.turning, 1.0, (self.high - self.low) / 100.0)
-        self.kept, self.tried = np.zeros((0, self.arm.num_inputs)), 0
-        num_places = max(self.arm.sensor.num_places, 1)
-        self.reached = np.zeros(num_places, dtype=int)  # postures at each place
-        self.refused: list[Counter[str]] = [Counter() for _ in self.reached]
+        unit = np.where(self.turning, 1.0, (high - low) / 100.0)
+        kept, tried = np.zeros((0, arm.num_inputs)), 0
+        # Of each place why postures tried for it were refused, and whether one was not.
+        refused = [Counter[str]() for _ in range(max(arm.sensor.num_places, 1))]
+        reached = np.zeros(len(refused), dtype=bool)
+        for batch in range(_ROUNDS):
+            if batch == _VAIN and not reached.all():
+                break
+            size = max(2 * (count - len(kept)), 64)
+            if len(kept):  # more where few were any good: a board is seldom in view
+                size = max(size, min(size * tried // (4 * len(kept)), _BATCH))
+            joints = rng.uniform(low, high, (size, arm.num_joints))
+            labels = np.zeros((size, len(arm.sensor.inputs)))
+            places = (len(kept) + np.arange(size)) % len(refused)
+            if len(refused) > 1:
+                labels[:, 0] = places
+            tried += size
+            commands, reasons = self.reach(np.hstack([joints, labels]), rng)
+            for command, reason, place in zip(commands, reasons, places, strict=True):
+                if len(kept) == count and reached[place]:
+                    continue  # enough; of the other places one posture is looked for
+                reason = reason or self._refused(command, kept, unit)
+                if reason:
+                    refused[place][reason] += 1
+                    continue
+                reached[place] = True
+                if len(kept) < count:
+                    kept = np.vstack([kept, command])
+            if len(kept) == count and reached.all():
+                return kept[in_turn(arm, kept)]
+        raise ValueError(self._shortfall(count, len(kept), tried, refused, reached))
 
-    def starts(self, rng: np.random.Generator) -> tuple[Array, NDArray[np.intp]]:
-        """(N, n) random commands to try next, and (N,) the place that each is for."""
-        kept, arm = len(self.kept), self.arm
-        size = max(2 * (self.count - kept), 64)
-        if kept:  # more where few were any good: a board is seldom in view
-            size = max(size, min(size * self.tried // (4 * kept), _BATCH))
-        self.tried += size
-        joints = rng.uniform(self.low, self.high, (size, arm.num_joints))
-        labels = np.zeros((size, len(arm.sensor.inputs)))
-        places = (kept + np.arange(size)) % len(self.reached)
-        if len(self.reached) > 1:
-            labels[:, 0] = places
-        return np.hstack([joints, labels]), places
-
-    def add(self, command: Array, reason: str, place: int) -> None:
-        """Keep a command for a place, unless there is a ``reason`` against it."""
+    def _refused(self, command: Array, kept: Array, unit: Array) -> str:
+        """Why a posture is not kept beside those that are, "" if it may be."""
         joints = command[: self.arm.num_joints]
-        if len(self.kept) == self.count and self.reached[place]:
-            return  # enough; of the other places one posture is looked for
-        if not reason:
-            apart = np.abs((self.kept[:, : len(joints)] - joints) / self.unit)
-            if len(self.kept) and apart.max(axis=1).min() < _APART:
-                reason = "are too close to another"
-            elif (may := self.where.allowed) is not None and not may(joints.copy()):
-                reason = "are not allowed"
-        if reason:
-            self.refused[place][reason] += 1
-            return
-        self.reached[place] += 1
-        if len(self.kept) < self.count:
-            self.kept = np.vstack([self.kept, command])
+        apart = np.abs((kept[:, : len(joints)] - joints) / unit).max(axis=1)
+        if apart.min(initial=np.inf) < _APART:
+            return "are too close to another"
+        may = self.allowed is None or self.allowed(joints.copy())
+        return "" if may else "are not allowed"
 
-    def shortfall(self) -> str:
+    def _shortfall(
+        self,
+        count: int,
+        kept: int,
+        tried: int,
+        refused: list[Counter[str]],
+        reached: NDArray[np.bool_],
+    ) -> str:
         """What is missing: a place that no posture reaches, or postures."""
-        missed = np.flatnonzero(self.reached == 0)
-        if len(self.reached) > 1 and len(missed):
-            place, refused = missed[0], self.refused[missed[0]]
+        missed = np.flatnonzero(~reached)
+        if len(reached) > 1 and len(missed):
+            place, reasons = missed[0], refused[missed[0]]
             places = getattr(self.arm.sensor, "places", None)
             where = "" if places is None else f" at {in_words(places[place])}"
             return (
                 f"no posture reaches {self.arm.sensor.kind} {place}{where}: of "
-                f"{refused.total()} postures tried {_counted(refused)}"
+                f"{reasons.total()} postures tried {_counted(reasons)}"
             )
-        reasons = _counted(sum(self.refused, Counter()))
-        if not len(self.kept):
-            near = self.where.near
+        all_reasons = _counted(sum(refused, Counter()))
+        if not kept:
+            near = self.near
             target = "what the sensor reads" if near is None else f"near = {near}"
             return (
-                f"no posture reaches {target} (of {self.tried} tried {reasons}). Is it "
+                f"no posture reaches {target} (of {tried} tried {all_reasons}). Is it "
                 "in the unit of the arm's lengths and in the frame of its base?"
             )
         return (
-            f"count must be at most {len(self.kept)} for this arm and sensor, got "
-            f"{self.count}: of {self.tried} postures tried {reasons}"
+            f"count must be at most {kept} for this arm and sensor, got {count}: of "
+            f"{tried} postures tried {all_reasons}"
         )
 
 
 def _counted(reasons: Counter[str]) -> str:
     return ", ".join(f"{number} {reason}" for reason, number in reasons.most_common())
+
+
+def _cone(approach: ArrayLike) -> Array:
+    """(4,) unit direction and the largest angle from it, 60 degrees if not given."""
+    cone = numbers("approach", approach)
+    cone = np.append(cone, 60.0) if cone.shape == (3,) else cone
+    size = np.linalg.norm(cone[:3])
+    if cone.shape != (4,) or not (size > 0.0 and 0.0 < cone[3] <= 180.0):
+        raise ValueError(
+            "approach must be a direction (x, y, z) and the largest angle from it in "
+            f"degrees, got {in_words(numbers('approach', approach))}"
+        )
+    return np.append(cone[:3] / size, cone[3])
 
 
 def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:

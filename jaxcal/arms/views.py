@@ -20,7 +20,6 @@ _FOCAL = 1.12  # times: focal lengths are known to a tenth, and arms are off
 _EDGE = 0.02  # of the picture's width, that the board stays away from its edge
 _FILLED = (0.8, 0.25)  # of the picture's width by the board, where no distance is given
 _TILT = 45.0  # degrees, where none is given
-_SIDES = {"+z": 1.0, "-z": -1.0}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,11 +37,10 @@ def view_of(
     camera: ArrayLike | None,
     distance: Sequence[float] | None,
     tilt: float | None,
-    side: str | None,
 ) -> View | None:
     """From (width, height, fx, fy, cx, cy), or a field of view in degrees (2,)."""
     if camera is None:
-        for name, value in (("distance", distance), ("tilt", tilt), ("side", side)):
+        for name, value in (("distance", distance), ("tilt", tilt)):
             if value is not None:
                 raise ValueError(f"{name} needs camera= and a board, got {value}")
         return None
@@ -60,8 +58,6 @@ def view_of(
     tilt = _TILT if tilt is None else tilt
     if not 0.0 < numbers("tilt", tilt) < 90.0:
         raise ValueError(f"tilt must be in (0, 90) degrees, got {tilt}")
-    if side is not None and side not in _SIDES:
-        raise ValueError(f"side must be '+z' or '-z', got {side!r}")
     if distance is None:
         points = arm.sensor.outline
         size = 2.0 * np.linalg.norm(points - points.mean(axis=0), axis=1).max()
@@ -76,8 +72,7 @@ def view_of(
         raise ValueError(
             f"distance must be (least, greatest), positive, got {distance}"
         )
-    known_side = _SIDES.get(side or "", arm.sensor.side)
-    return View(lens, (low, high), float(tilt), known_side)
+    return View(lens, (low, high), float(tilt), arm.sensor.side)
 
 
 def _posed(arm: Chain) -> tuple[Board, Chain]:

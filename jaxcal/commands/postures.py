@@ -49,11 +49,6 @@ class ViewOptions:
     tilt: Annotated[
         float | None, "largest angle between board and camera in degrees, default 45"
     ] = None
-    side: Annotated[
-        str | None,
-        "side of the board that is printed, along its z axis",
-        ["+z", "-z"],
-    ] = None
 
     def with_board(self, arm: SerialChain) -> SerialChain:
         """The arm whose board is of this width and height, if they are given."""
@@ -78,12 +73,6 @@ class RoomOptions:
     approach: Annotated[
         list[float] | None,
         "the tool's approach: direction and largest angle from it: 0,0,-1,60",
-        several(float, "numbers"),
-    ] = None
-    clear: Annotated[
-        list[list[float]] | None,
-        "plane (normal, offset) or box (least x,y,z, greatest) that the links avoid; "
-        "links are spheres along lines between the joints; may be repeated",
         several(float, "numbers"),
     ] = None
 
@@ -124,7 +113,7 @@ def postures(
     The postures lie within the joint limits, where the sensor reads, and are chosen for
     accurate predictions of the calibrated arm. With --measured the remaining postures
     complement those already measured, which also locate sockets, planes and boards.
-    Collisions are checked only by --floor, --approach and --clear.
+    Collisions are checked only by --floor and --approach.
     """
     if picture:
         with needs("plots", "--picture"):
@@ -153,10 +142,8 @@ def postures(
         camera=view.camera,
         distance=view.away,
         tilt=view.tilt,
-        side=view.side,
         floor=room.floor,
         approach=room.approach,
-        clear=room.clear or (),
     )
     design = Design(offered, model=arm, measured=done)
     chosen = design.select(more, method="exchange").indices

@@ -178,7 +178,7 @@ def test_contacts_are_good_exactly_where_the_arm_is_better_elsewhere(size, seed)
         warnings.simplefilter("ignore", UserWarning)
         found = jaxcal.identify(commands, None, model=arm)
     error = _apart(found.arm.predict(rest), points)
-    nominal = _apart(arm.nominal_tips(rest), points)
+    nominal = _apart(arm.nominal_tip(rest).position, points)
     assert found.verdict.good == (error < nominal), str(found.verdict)
     assert error < 2.0 * found.verdict.anywhere
     if (size, seed) == (2.0, 0):

@@ -33,13 +33,13 @@ def _frames(arm, joints, parameters):
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("side", ["+z", "-z"])
+@pytest.mark.parametrize("side", [1.0, -1.0])
 def test_views_hold_the_whole_board_from_its_printed_side(side, seed):
     """By a camera whose focal length is off by a tenth, on an arm that is off."""
-    sensor = Board("camera", PLACE, CORNERS, CAMERA[2:])
+    sensor = Board("camera", PLACE, CORNERS, CAMERA[2:], side)
     arm = ur5(sensor=sensor)
     arm = SerialChain.from_dh(arm.table, tool=MOUNT, sensor=sensor)
-    joints = arm.postures(40, seed=seed, camera=CAMERA, side=side, tilt=40.0)
+    joints = arm.postures(40, seed=seed, camera=CAMERA, tilt=40.0)
     rng, truth = np.random.default_rng(seed), arm.nominal.copy()
     std = np.asarray(arm.default_prior().std)[: arm.table.size]
     truth[: arm.table.size] += std * rng.normal(size=len(std))
@@ -51,15 +51,16 @@ def test_views_hold_the_whole_board_from_its_printed_side(side, seed):
         inside &= (pixels < [1280.0, 960.0]).all(axis=-1)
         assert inside.all(axis=1).mean() >= 0.95
     towards = -(seen[:, :3, 2] * seen[:, :3, 3]).sum(axis=1)
-    sign = 1.0 if side == "+z" else -1.0
-    assert (sign * towards > 0.0).all()
+    assert (side * towards > 0.0).all()
 
 
 def test_the_printed_side_is_known_from_views():
     exact = SerialChain.from_dh(
-        ur5().table, tool=MOUNT, sensor=Board("camera", PLACE, CORNERS, CAMERA[2:])
+        ur5().table,
+        tool=MOUNT,
+        sensor=Board("camera", PLACE, CORNERS, CAMERA[2:], -1.0),
     )
-    joints = exact.postures(5, camera=CAMERA, side="-z", seed=1)
+    joints = exact.postures(5, camera=CAMERA, seed=1)
     unknown = exact.measured_with(Board("camera", None, CORNERS, CAMERA[2:]))
     found = unknown.located(joints, exact.predict(joints))
     assert found.sensor.side == -1.0
@@ -181,19 +182,6 @@ def _cut(arm, links):
     return SerialChain.from_dh(arm.table[:links])
 
 
-def test_links_stay_clear_of_boxes():
-    arm = ur5(sensor=Socket(1))
-    box = (-300.0, -150.0, 300.0, 300.0, 150.0, 700.0)
-    for clear in ({}, {"clear": (box,), "radius": 40.0}):
-        found = arm.postures(40, near=NEAR[:1], **clear)
-        points = arm.skeleton(found)
-        share = np.linspace(0.0, 1.0, 50)[:, None]
-        upper = points[:, 2, None] + share * (points[:, 3] - points[:, 2])[:, None]
-        outside = np.maximum(np.array(box[:3]) - upper, upper - np.array(box[3:]))
-        far = np.linalg.norm(outside.clip(0.0), axis=-1).min(axis=1)
-        assert (far.min() > 35.0) == bool(clear)
-
-
 @pytest.mark.slow
 def test_a_socket_that_no_posture_reaches_is_named():
     arm = ur5(sensor=Socket(2))
@@ -209,20 +197,15 @@ def test_wrong_rooms_and_views_are_named():
     near = [[0.4, 0.1, 0.3]]
     for options, why in (
         ({"camera": CAMERA}, "camera needs an arm with sensor=Board"),
-        ({"side": "+z"}, "side needs camera="),
         ({"tilt": 100.0}, "tilt needs camera=.*got 100"),
         ({"distance": (0.2, 0.5)}, "distance needs camera="),
         ({"approach": (0, 0, 0)}, "approach must be a direction"),
-        ({"clear": [(1, 2, 3)]}, "clear must hold planes"),
-        ({"radius": 0.1}, "radius needs clear="),
-        ({"radius": 0.0, "clear": [(0, 0, 1, 0)]}, "radius must be positive"),
-        ({"floor": 0.45}, r"socket 0 at \(0.4, 0.1, 0.3\) is below floor = 0.45"),
+        ({"floor": 0.45}, r"no posture reaches near = .* are below the floor"),
     ):
         with pytest.raises(ValueError, match=why):
             touching.postures(5, near=near, **options)
     for options, why in (
         ({"camera": (1, 2, 3)}, "camera must be"),
-        ({"camera": CAMERA, "side": "front"}, "side must be"),
         ({"camera": CAMERA, "tilt": 95.0}, "tilt must be in"),
         ({"camera": CAMERA, "distance": (0.5, 0.2)}, "distance must be"),
     ):
