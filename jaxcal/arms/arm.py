@@ -29,6 +29,7 @@ WAVES = ("sin", "cos", "sin2", "cos2")
 _BASE, _ROW, _TOOL = (0, 1, 2, 3, 4, 5, 6), (0, 3, 2, 5, 4), (0, 1, 2, 7, 3, 4, 5)
 _STILL = 0.02  # of the arm's length: the way of a slide that shows no size
 _PARALLEL, _CANCELS = 0.2, 3.0  # sine; times as long as what is left: lengths cancel
+_SAME = 1e-9  # of lengths and degrees: one and the same link
 _MANY = 2_000  # postures: what is found of so many is not kept
 # Where a, alpha, d, theta and beta act among the five steps of a row.
 _ORDER = {"standard": (2, 3, 1, 0, 4), "modified": (0, 1, 4, 3, 2)}
@@ -455,3 +456,23 @@ def _cross(left: Array, right: Array) -> Array:
     x, y, z = (left[..., k, :] for k in range(3))
     u, v, w = (right[..., k, :] for k in range(3))
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-2)
+
+
+def common(one: Arm, other: Arm) -> int:
+    """Leading joints that two chains have in common."""
+    stands = np.allclose(one.base, other.base, atol=_SAME)
+    if not stands or one.convention != other.convention:
+        return 0
+    least = min(len(one.joints), len(other.joints))
+    return next((i for i in range(least) if not _alike(one, other, i)), least)
+
+
+def _alike(one: Arm, other: Arm, i: int) -> bool:
+    """Whether joint ``i`` is the same of both, and the link before it."""
+    names = [
+        [a.joint_names[k] for k in np.flatnonzero(a.drive[i])] for a in (one, other)
+    ]
+    link = i == 0 or np.allclose(one.table[i - 1], other.table[i - 1], atol=_SAME)
+    kind = one.joints[i] == other.joints[i]
+    moves = one.drive[i][one.drive[i] != 0.0], other.drive[i][other.drive[i] != 0.0]
+    return bool(link and kind and names[0] == names[1] and np.array_equal(*moves))

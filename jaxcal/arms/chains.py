@@ -6,25 +6,22 @@ import contextlib
 import dataclasses
 import functools
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.csgraph import connected_components
 
-from jaxcal.arms.arm import COLUMNS, WAVES
+from jaxcal.arms.arm import COLUMNS, WAVES, common
 from jaxcal.arms.chain import SerialChain
 from jaxcal.arms.sensors import Sensor
 from jaxcal.arms.sensors.sensor import BASE, Readings, label
 from jaxcal.arms.sensors.several import OneTable, stacked
 from jaxcal.checks import Array, one_of
-from jaxcal.files import write_over
 from jaxcal.late import late
 from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise, Prior
-
-_SAME = 1e-9  # of lengths and degrees: one and the same link
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,7 +48,9 @@ class Chains(Model):
 
     # Of modules that know this one.
     prepared = late("jaxcal.arms.located:prepared_chains")
-    verdict = late("jaxcal.arms.verdict:verdict_of_chains")
+    verdict = late("jaxcal.arms.chains_verdict:verdict_of_chains")
+    of_chain = late("jaxcal.arms.chains_verdict:of_chain")
+    write = late("jaxcal.arms.files.write:write_chains")
 
     tips: tuple[str, ...]
     chains: tuple[SerialChain, ...]
@@ -68,18 +67,22 @@ class Chains(Model):
         tips, arms = tuple(chains), tuple(chains.values())
         if len(arms) < 2 or not all(isinstance(arm, SerialChain) for arm in arms):
             raise ValueError("chains must hold at least two arms (SerialChain), by tip")
-        model = cls(tips, arms, _numbered([arm.sensor.members for arm in arms]))
         for k, arm in enumerate(arms):
             for other, before in zip(arms[:k], tips, strict=False):
-                common = _common(other, arm)
-                twice = set(other.joint_names) & set(arm.joint_names[common:])
+                differing = arm.joint_names[common(other, arm) :]
+                twice = set(other.joint_names).intersection(differing)
                 if twice:
                     raise ValueError(
                         f"joint {sorted(twice)[0]} is in the chains {before} and "
                         f"{tips[k]}, which differ before it. Give joints of different "
                         "chains different names (joint_names)"
                     )
-        return model
+        numbers: dict[tuple[int, int], int] = {}  # one for one object of several chains
+        stands = []
+        for of_chain in (arm.sensor.members for arm in arms):
+            keys = [(id(x), of_chain[:i].count(x)) for i, x in enumerate(of_chain)]
+            stands.append(tuple(numbers.setdefault(key, len(numbers)) for key in keys))
+        return cls(tips, arms, tuple(stands))
 
     @classmethod
     def from_urdf(
@@ -102,13 +105,12 @@ class Chains(Model):
             base, locked, limits: as of ``SerialChain.from_urdf``, of joints of any
                 chain.
         """
-        arms = {}
+        arms, ends = {}, dict(limits or {})
         for tip, sensor in sensors.items():
             arm = SerialChain.from_urdf(
                 path, base=base, tip=tip, sensor=sensor, locked=locked
             )
-            names = (limits or {}).keys() & {*arm.joint_names}
-            arms[tip] = arm._limited({name: (limits or {})[name] for name in names})
+            arms[tip] = arm._limited({n: ends[n] for n in arm.joint_names if n in ends})
         model = cls.of(arms)
         chains = []
         for arm, shared in zip(model.chains, model._shared, strict=True):
@@ -121,32 +123,18 @@ class Chains(Model):
     def _shared(self) -> tuple[int, ...]:
         """(C,) leading joints of each chain that another one has too."""
         return tuple(
-            max(_common(arm, other) for other in self.chains if other is not arm)
+            max(common(arm, other) for other in self.chains if other is not arm)
             for arm in self.chains
         )
 
     @functools.cached_property
-    def _named(self) -> list[list[str]]:
-        """Names in this model of the parameters of each chain."""
-        named = []
-        for k, (tip, arm, shared) in enumerate(
-            zip(self.tips, self.chains, self._shared, strict=True)
-        ):
-            links = [f"{name}{i}" for i in range(1, shared) for name in COLUMNS]
-            common = {*links, *(BASE if shared else ())}
-            for i in range(1, shared + 1):
-                common |= {f"gear{i}", f"compliance{i}"}
-                common |= {f"theta{i} {wave}" for wave in WAVES}
-            of_arm = [n if n in common else f"{tip}: {n}" for n in arm.names]
-            for i, number in enumerate(self.stands[k]):
-                (first, at), *others = self._members[number]
-                if others:
-                    names = self.chains[first].names[self.chains[first].own(at)]
-                    everywhere = len(others) == len(self.chains) - 1
-                    of_first = "" if everywhere else f"{self.tips[first]}: "
-                    of_arm[arm.own(i)] = [of_first + name for name in names]
-            named.append(of_arm)
-        return named
+    def _firsts(self) -> list[int]:
+        """Of each chain the first one that has its base."""
+        arms = self.chains
+        return [
+            next(j for j in range(k + 1) if j == k or common(arms[j], arms[k]))
+            for k in range(len(arms))
+        ]
 
     @functools.cached_property
     def _members(self) -> list[list[tuple[int, int]]]:
@@ -161,25 +149,45 @@ class Chains(Model):
     def _cells(self) -> NDArray[np.int32]:
         """(C,) equal for chains that show where each other stands: by joints or things
         that they share."""
-        linked = np.array(
-            [[_common(one, other) > 0 for other in self.chains] for one in self.chains]
-        )
+        linked = np.array([[common(a, b) for b in self.chains] for a in self.chains])
         for owners in self._members:
             k, i = owners[0]
             if self.chains[k].sensor.members[i].stands:
                 numbers = [number for number, _ in owners]
-                linked[np.ix_(numbers, numbers)] = True
+                linked[np.ix_(numbers, numbers)] = 1
         return np.asarray(connected_components(linked)[1])
+
+    @functools.cached_property
+    def _named(self) -> list[list[str]]:
+        """Names in this model of the parameters of each chain."""
+        named = []
+        for k, (tip, arm, shared) in enumerate(
+            zip(self.tips, self.chains, self._shared, strict=True)
+        ):
+            links = [f"{name}{i}" for i in range(1, shared) for name in COLUMNS]
+            of_all = {*links, *(BASE if shared else ())}
+            for i in range(1, shared + 1):
+                of_all |= {f"gear{i}", f"compliance{i}"}
+                of_all |= {f"theta{i} {wave}" for wave in WAVES}
+            of_arm = [n if n in of_all else f"{tip}: {n}" for n in arm.names]
+            for i, number in enumerate(self.stands[k]):
+                (first, at), *others = self._members[number]
+                if others:
+                    names = self.chains[first].names[self.chains[first].own(at)]
+                    everywhere = len(others) == len(self.chains) - 1
+                    of_first = "" if everywhere else f"{self.tips[first]}: "
+                    of_arm[arm.own(i)] = [of_first + name for name in names]
+            named.append(of_arm)
+        return named
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """p: of chain after chain, harmonics of all last."""
-        kept, waves = [], []
-        for arm, named in zip(self.chains, self._named, strict=True):
-            end = len(named) - arm.waves.size
-            kept += named[:end]
-            waves += named[end:]
-        return tuple(dict.fromkeys([*kept, *waves]))
+        ends = [arm._at["harmonics"].start for arm in self.chains]
+        both = [*zip(self._named, ends, strict=True)]
+        first = [name for named, end in both for name in named[:end]]
+        waves = [name for named, end in both for name in named[end:]]
+        return tuple(dict.fromkeys([*first, *waves]))
 
     @functools.cached_property
     def members(self) -> tuple[NDArray[np.intp], ...]:
@@ -193,6 +201,38 @@ class Chains(Model):
         for at, of_arm in zip(self.members[::-1], values[::-1], strict=True):
             result[at] = of_arm
         return result
+
+    def _of_arms(
+        self, some: Callable[[SerialChain], Collection[str]]
+    ) -> tuple[str, ...]:
+        """Names here of some of each chain's parameters, those shared once."""
+        names: dict[str, None] = {}
+        for arm, named in zip(self.chains, self._named, strict=True):
+            wanted, both = some(arm), zip(named, arm.names, strict=True)
+            names |= dict.fromkeys(name for name, short in both if short in wanted)
+        return tuple(names)
+
+    def _with(
+        self, sensors: Mapping[int, Sensor], arm: SerialChain, k: int
+    ) -> SerialChain:
+        """An arm with sensors by number."""
+        members = [*arm.sensor.members]
+        mine = [i for i, number in enumerate(self.stands[k]) if number in sensors]
+        for i in mine:
+            members[i] = sensors[self.stands[k][i]]
+        return arm.measured_with(arm.sensor.with_members(members)) if mine else arm
+
+    def with_member(self, number: int, sensor: Sensor) -> Self:
+        """These chains with another sensor in the place of ``number``."""
+        chains = [self._with({number: sensor}, a, k) for k, a in enumerate(self.chains)]
+        return dataclasses.replace(self, chains=tuple(chains))
+
+    def _each(self, change: Callable[[SerialChain], SerialChain]) -> Self:
+        """These chains with each changed; themselves where none is."""
+        arms = tuple(change(arm) for arm in self.chains)
+        if all(a is b for a, b in zip(arms, self.chains, strict=True)):
+            return self
+        return dataclasses.replace(self, chains=arms)
 
     def _parts(
         self, commands: Array
@@ -214,6 +254,27 @@ class Chains(Model):
         arm = self.chains[k]
         return arm.sensor.stds(arm.length or 1.0)
 
+    def _by_member(
+        self,
+        arms: Sequence[SerialChain],
+        tables: Sequence[tuple[int, Array, Array | None]],
+    ) -> dict[int, list[Readings]]:
+        """What each chain read of a sensor, by its number."""
+        by_member: dict[int, list[Readings]] = {}
+        for k, commands, measured in tables:
+            of_members = arms[k].readings(commands, measured)
+            for number, readings in zip(self.stands[k], of_members, strict=True):
+                by_member.setdefault(number, []).append(readings)
+        return by_member
+
+    @contextlib.contextmanager
+    def _naming(self, k: int) -> Iterator[None]:
+        """The chain's name before what is refused of it."""
+        try:
+            yield
+        except ValueError as error:
+            raise ValueError(f"{self.tips[k]}: {error}") from None
+
     @functools.cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Columns of the joints, chain after chain."""
@@ -233,6 +294,36 @@ class Chains(Model):
     def num_outputs(self) -> int:
         """q, of the sensor that reads most."""
         return max(arm.num_outputs for arm in self.chains)
+
+    def together(
+        self, tables: Mapping[str, tuple[ArrayLike, ArrayLike | None]]
+    ) -> tuple[Array, Array]:
+        """Commands (N, n) and readings (N, q) in noise of all chains, for a fit.
+
+        Args:
+            tables: by tip a pair: commands of that chain with its sensor's columns, and
+                what it measured, or None for zeros (contacts) and candidates.
+        """
+        named = []
+        for tip, (given, read) in tables.items():
+            k = self.tips.index(one_of("tip", tip, self.tips))
+            named.append(
+                OneTable(tip, k, self._columns[k], self._scale(k), given, read)
+            )
+        place, q = len(self.joint_names), self.num_outputs
+        return stacked(named, place, self.num_inputs, q)
+
+    def require_commands(self, commands: Array) -> None:
+        for k, arm, _, arm_commands in self._parts(commands):
+            with self._naming(k):
+                arm.require_commands(arm_commands)
+
+    def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
+        counting = [
+            rows[arm.distinct(arm_commands, measured[rows])]
+            for _, arm, rows, arm_commands in self._parts(commands)
+        ]
+        return np.sort(np.concatenate(counting))
 
     @property
     def nominal(self) -> Array:
@@ -333,24 +424,16 @@ class Chains(Model):
         """
         priors = [arm.default_prior() for arm in self.chains]
         fixed = [set(prior.fixed) for prior in priors]
-        unseen_of_base = [set(BASE) & names for names in fixed]
         for k, cell in enumerate(self._cells):
-            first, *_ = cell_mates = np.flatnonzero(self._cells == cell)
+            alike = np.flatnonzero(self._cells == cell)
             fixed[k] -= set(BASE)
-            if k == first or _common(self.chains[first], self.chains[k]):
-                fixed[k] |= set(BASE).intersection(
-                    *(unseen_of_base[mate] for mate in cell_mates)
-                )
-        observed = {
-            name
-            for arm, named, of_arm in zip(self.chains, self._named, fixed, strict=True)
-            for name, short in zip(named, arm.names, strict=True)
-            if short not in of_arm
-        }
+            if k == alike[0] or common(self.chains[alike[0]], self.chains[k]):
+                fixed[k] |= set(BASE).intersection(*(priors[j].fixed for j in alike))
+        hidden = dict(zip(self.chains, fixed, strict=True))
+        seen = {*self._of_arms(lambda arm: {*arm.names} - hidden[arm])}
+        unseen = [n for n in self._of_arms(lambda arm: arm.names) if n not in seen]
         std = self._gather([np.asarray(prior.std) for prior in priors])
-        names = dict.fromkeys(name for named in self._named for name in named)
-        unseen = tuple(name for name in names if name not in observed)
-        return Prior(std, fixed=unseen, by_data=True)
+        return Prior(std, fixed=tuple(unseen), by_data=True)
 
     def parameter_sizes(self) -> Array:
         sizes = [arm.parameter_sizes() for arm in self.chains]
@@ -387,84 +470,6 @@ class Chains(Model):
     def _bent(self) -> Self:  # kept, and what it keeps with it
         return self._each(SerialChain.with_misfit)
 
-    def _each(self, change: Callable[[SerialChain], SerialChain]) -> Self:
-        """These chains with each changed; themselves where none is."""
-        arms = tuple(change(arm) for arm in self.chains)
-        if all(a is b for a, b in zip(arms, self.chains, strict=True)):
-            return self
-        return dataclasses.replace(self, chains=arms)
-
-    def together(
-        self, tables: Mapping[str, tuple[ArrayLike, ArrayLike | None]]
-    ) -> tuple[Array, Array]:
-        """Commands (N, n) and readings (N, q) in noise of all chains, for a fit.
-
-        Args:
-            tables: by tip a pair: commands of that chain with its sensor's columns, and
-                what it measured, or None for zeros (contacts) and candidates.
-        """
-        named = []
-        for tip, (given, read) in tables.items():
-            k = self.tips.index(one_of("tip", tip, self.tips))
-            named.append(
-                OneTable(tip, k, self._columns[k], self._scale(k), given, read)
-            )
-        label, q = len(self.joint_names), self.num_outputs
-        return stacked(named, label, self.num_inputs, q)
-
-    def require_commands(self, commands: Array) -> None:
-        for k, arm, _, arm_commands in self._parts(commands):
-            with self._naming(k):
-                arm.require_commands(arm_commands)
-
-    @contextlib.contextmanager
-    def _naming(self, k: int) -> Iterator[None]:
-        """The chain's name before what is refused of it."""
-        try:
-            yield
-        except ValueError as error:
-            raise ValueError(f"{self.tips[k]}: {error}") from None
-
-    @functools.cached_property
-    def _firsts(self) -> list[int]:
-        """Of each chain the first one that has its base."""
-        arms = self.chains
-        return [
-            next(j for j in range(k + 1) if j == k or _common(arms[j], arms[k]))
-            for k in range(len(arms))
-        ]
-
-    def _with(
-        self, placed: Mapping[int, Sensor], arm: SerialChain, k: int
-    ) -> SerialChain:
-        """An arm with sensors by number."""
-        members = [
-            placed.get(number, one)
-            for one, number in zip(arm.sensor.members, self.stands[k], strict=True)
-        ]
-        if all(a is b for a, b in zip(members, arm.sensor.members, strict=True)):
-            return arm
-        return arm.measured_with(arm.sensor.with_members(members))
-
-    def _by_member(
-        self,
-        arms: Sequence[SerialChain],
-        tables: Sequence[tuple[int, Array, Array | None]],
-    ) -> dict[int, list[Readings]]:
-        """What each chain read of a sensor, by its number."""
-        by_member: dict[int, list[Readings]] = {}
-        for k, commands, measured in tables:
-            of_members = arms[k].readings(commands, measured)
-            for number, readings in zip(self.stands[k], of_members, strict=True):
-                by_member.setdefault(number, []).append(readings)
-        return by_member
-
-    def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
-        kept = []
-        for _, arm, rows, arm_commands in self._parts(commands):
-            kept.append(rows[arm.distinct(arm_commands, measured[rows])])
-        return np.sort(np.concatenate(kept))
-
     @property
     def placed(self) -> tuple[str, ...]:
         return self._of_arms(lambda arm: arm.placed)
@@ -472,59 +477,6 @@ class Chains(Model):
     @property
     def slips(self) -> tuple[str, ...]:
         return self._of_arms(lambda arm: arm.slips)
-
-    def _of_arms(
-        self, some: Callable[[SerialChain], tuple[str, ...]]
-    ) -> tuple[str, ...]:
-        """Names here of some of each chain's parameters, those shared once."""
-        names = (
-            name
-            for arm, named in zip(self.chains, self._named, strict=True)
-            for name, short in zip(named, arm.names, strict=True)
-            if short in some(arm)
-        )
-        return tuple(dict.fromkeys(names))
-
-    def of_chain(self, fit: Any, tip: str) -> dict[str, Any]:
-        """The fields of a calibration that are of one chain, in its own units."""
-        k = self.tips.index(one_of("tip", tip, self.tips))
-        arm, at, scale = self.chains[k], fit.whole.members[k], self._scale(k)
-        q, rows = arm.num_outputs, fit.commands[:, len(self.joint_names)] == k
-        residuals = fit.residuals[rows, :q] * scale
-        noise = None if fit.noise_std is None else fit.noise_std[:q] * scale
-        square = fit.square
-        if noise is not None:
-            weights = fit.loss_weights[rows]
-            square = float((weights[:, None] * (residuals / noise) ** 2).sum())
-        share = int(rows.sum()) * q / max(len(fit.commands) * self.num_outputs, 1)
-        null = fit.unidentified
-        if null is not None:
-            null = null[:, at]
-            null = null[np.abs(null).max(axis=1, initial=0.0) > 0.0]
-        joint = fit.joint_covariance
-        by_parameter = ("estimate", "prior_mean", "prior_precision", "free")
-        by_row = ("loss_weights", "distance")
-        return {
-            **{name: getattr(fit, name)[at] for name in by_parameter},
-            **{name: getattr(fit, name)[rows] for name in by_row},
-            "model": arm,
-            "input_names": (*arm.joint_names, *arm.sensor.inputs),
-            "output_names": tuple(arm.sensor.outputs),
-            "joint_covariance": None if joint is None else joint[np.ix_(at, at)],
-            "unidentified": null if null is not None and len(null) else None,
-            "commands": fit.commands[rows][:, self._columns[k]],
-            "estimated_commands": None,
-            "residuals": residuals,
-            "dof": max(fit.dof * share, 0.0),
-            "square": square,
-            "num_readings": float(q),
-            "noise_std": noise,
-        }
-
-    def with_member(self, number: int, sensor: Sensor) -> Self:
-        """These chains with another sensor in the place of ``number``."""
-        chains = [self._with({number: sensor}, a, k) for k, a in enumerate(self.chains)]
-        return dataclasses.replace(self, chains=tuple(chains))
 
     def calibrated(self, parameters: ArrayLike) -> Self:
         """The chains whose nominal is this one with ``parameters``."""
@@ -535,24 +487,6 @@ class Chains(Model):
 
     def writable(self) -> Self:
         return self._each(SerialChain.writable)
-
-    def write(
-        self,
-        form: str,
-        path: str | os.PathLike[str],
-        parameters: ArrayLike,
-        *,
-        force: bool = False,
-    ) -> str:
-        """Write the URDF file that all chains came from, every chain corrected; the tip
-        links, with a comma between."""
-        from jaxcal.arms.files.write import urdf_text
-
-        one_of("form", form, ("urdf",))
-        calibrated = self.calibrated(parameters).chains
-        text, tips = urdf_text([*zip(self.chains, calibrated, strict=True)])
-        write_over(path, text, force)
-        return ", ".join(tips)
 
     def to_dict(self) -> dict[str, Any]:
         arms = [arm.to_dict() for arm in self.chains]
@@ -569,33 +503,3 @@ class Chains(Model):
             for arm in chains
         ]
         return cls(tuple(tips), tuple(arms), tuple(map(tuple, stands)))
-
-
-def _common(one: SerialChain, other: SerialChain) -> int:
-    """Leading joints that two chains have in common."""
-    stands = np.allclose(one.base, other.base, atol=_SAME)
-    if not stands or one.convention != other.convention:
-        return 0
-    least = min(len(one.joints), len(other.joints))
-    return next((i for i in range(least) if not _alike(one, other, i)), least)
-
-
-def _alike(one: SerialChain, other: SerialChain, i: int) -> bool:
-    """Whether joint ``i`` is the same of both, and the link before it."""
-    names = [
-        [a.joint_names[k] for k in np.flatnonzero(a.drive[i])] for a in (one, other)
-    ]
-    link = i == 0 or np.allclose(one.table[i - 1], other.table[i - 1], atol=_SAME)
-    kind = one.joints[i] == other.joints[i]
-    moves = one.drive[i][one.drive[i] != 0.0], other.drive[i][other.drive[i] != 0.0]
-    return bool(link and kind and names[0] == names[1] and np.array_equal(*moves))
-
-
-def _numbered(members: Sequence[Sequence[Sensor]]) -> tuple[tuple[int, ...], ...]:
-    """Numbers of each chain's sensors, one for one object of different chains."""
-    numbers: dict[tuple[int, int], int] = {}
-    stands = []
-    for of_chain in members:
-        keys = [(id(one), of_chain[:i].count(one)) for i, one in enumerate(of_chain)]
-        stands.append(tuple(numbers.setdefault(key, len(numbers)) for key in keys))
-    return tuple(stands)

@@ -8,21 +8,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arms.chain import SerialChain as Chain
-from jaxcal.arms.chains import Chains
 from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
 from jaxcal.arms.findings import (
-    CLEAR_UP,
     MORE,
     Findings,
     Part,
     findings_of,
-    other_distances,
     parts_of,
     unit_after,
 )
@@ -411,60 +408,3 @@ def _anywhere(fit: Fit, model: Chain, parts: list[Part]) -> tuple[Part, float]:
     basis = basis[:, significant(size)]
     moves = moves - basis @ (basis.T @ moves)
     return part, float(np.sqrt(((moves @ covariance) * moves).sum() / _DRAWN))
-
-
-@dataclasses.dataclass(frozen=True)
-class ChainsVerdict(models.Verdict):
-    """What the readings say of each chain."""
-
-    of_chains: Mapping[str, ArmVerdict] = dataclasses.field(default_factory=dict)
-
-    @property
-    def held_out(self) -> float:
-        """Mean held-out error of the chains, each in its unit."""
-        return float(np.mean([of_arm.held_out for of_arm in self.of_chains.values()]))
-
-
-def verdict_of_chains(model: Chains, fit: Any) -> ChainsVerdict:
-    """Good where every chain that was read is, and distances that they share."""
-    used = np.flatnonzero(fit.loss_weights > 0.0)
-    tables = [
-        (k, commands, None) for k, _, _, commands in model._parts(fit.commands[used])
-    ]
-    tips = [model.tips[k] for k, *_ in tables]
-    of_chains = {tip: fit.of(tip).verdict for tip in tips}
-    bad = [tip for tip in tips if not of_chains[tip].good]
-    step = f"{bad[0]}: {of_chains[bad[0]].next_step}" if bad else models.USE
-    reasons = [f"{tip}: {line}" for tip in tips for line in of_chains[tip].lines()]
-    reasons += [f"{tip}: no reading" for tip in model.tips if tip not in tips]
-    wrong = False
-    if fit.noise_std is None:
-        step = "measure more postures, or state noise_std=1 (in units of noise)"
-    else:
-        length = min(arm.length for arm in model.chains)
-        parts = _shared_parts(model, used, tables)
-        apart, wrong = other_distances(fit, parts, length)
-        reasons += apart
-        step = CLEAR_UP if wrong else step
-    good = not (bad or wrong)
-    return ChainsVerdict(good, tuple(reasons), step, "", of_chains)
-
-
-def _shared_parts(
-    model: Chains, used: NDArray[np.intp], tables: list[tuple[int, Array, None]]
-) -> list[Part]:
-    """What chains read of the sensors that they share, of the rows ``used``; distances
-    that one chain's contacts judge are left to its own verdict."""
-    parts = []
-    for number, readings in model._by_member(model.chains, tables).items():
-        if len(readings) < 2:
-            continue
-        k, i = model._members[number][0]
-        sensor, own = readings[0].sensor, model.members[k][model.chains[k].own(i)]
-        columns = np.vstack([of_chain.columns for of_chain in readings])
-        points = np.vstack([of_chain.tip.position for of_chain in readings])
-        where = (used, columns, points, own, readings[0].scale)
-        part = Part(number, sensor, sensor.kind, "", *where)
-        alone = [part._replace(columns=r.columns).touched() for r in readings]
-        parts.append(part._replace(judged=np.any(alone, axis=0)))
-    return parts

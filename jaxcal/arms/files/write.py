@@ -40,6 +40,7 @@ from jaxcal.models.model import as_parameters
 
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain
+    from jaxcal.arms.chains import Chains
 
 _TAG = re.compile(rb"""(?:[^>"']+|"[^"]*"|'[^']*')*>""")
 _SAME = 1e-13  # metres and radians: no correction
@@ -122,6 +123,23 @@ def write(
         text = _dh_text(calibrated) if form == "dh" else _ur_text(arm, calibrated)
     write_over(path, text, force)
     return tip
+
+
+def write_chains(
+    model: Chains,
+    form: str,
+    path: str | os.PathLike[str],
+    parameters: ArrayLike,
+    *,
+    force: bool = False,
+) -> str:
+    """Write the URDF file that all chains came from, every chain corrected; the tip
+    links, with a comma between."""
+    one_of("form", form, ("urdf",))
+    calibrated = model.calibrated(parameters).chains
+    text, tips = urdf_text([*zip(model.chains, calibrated, strict=True)])
+    write_over(path, text, force)
+    return ", ".join(tips)
 
 
 def standing_as(arm: Chain, other: Any, parameters: Array, commands: Array) -> Array:
