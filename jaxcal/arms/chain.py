@@ -28,20 +28,8 @@ from jaxcal.arms.sensors import Position, Sensor, Several
 from jaxcal.arms.sensors.several import OneTable, stacked
 from jaxcal.checks import Array, array_of, axis_names, numbers, one_of
 from jaxcal.late import late
-from jaxcal.models.model import ErrorGroups, Model, Quantity, as_commands, as_parameters
-from jaxcal.models.uncertainty import Noise, Prior
-
-# Standard deviations of the default prior. On a UR5 (links of 1.19 m in all): 1.8 mm,
-# 0.3 degrees of the axes and 0.5 of a joint's zero, which is set by hand; 0.12 m and
-# 1.7 degrees of the base and the tool.
-_LENGTH, _TWIST, _ZERO = 1.5e-3, 0.3, 0.5  # share of the links' length; degrees
-_GEAR, _SAG = 5e-3, 0.5  # ratio; degrees under the largest torque
-_WAVE = 0.045  # degrees, of gears
-_MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
-# How large the errors of a group are beside the prior's, beforehand: lengths, turns of
-# the axes, zeros of the joints, compliance, harmonics. Most arms have little misfit and
-# some have much.
-_SIZES, _SIZES_SPREAD = (1.0, 1.0, 1.0, 1.0, 0.1), (6.0, 6.0, 6.0, 6.0, 10.0)
+from jaxcal.models.model import Model, Quantity, as_commands, as_parameters
+from jaxcal.models.uncertainty import Noise
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,6 +59,9 @@ class SerialChain(Arm, Model):
     reachable = late("jaxcal.arms.postures:reachable")
     in_turn = late("jaxcal.arms.postures:in_turn")
     improved = late("jaxcal.arms.effects:improved")
+    default_prior = late("jaxcal.arms.effects:default_prior")
+    parameter_sizes = late("jaxcal.arms.effects:parameter_sizes")
+    error_groups = late("jaxcal.arms.effects:error_groups")
     unexplained = late("jaxcal.arms.effects:unexplained")
     noise_with_play = late("jaxcal.arms.effects:noise_with_play")
     from_one_side = late("jaxcal.arms.effects:from_one_side")
@@ -327,10 +318,8 @@ class SerialChain(Arm, Model):
         """This arm with stiff joints and round gears, as files have them."""
         if not self.compliance and not self.harmonics:
             return self
-        round_gears = {"harmonics": (), "waves": np.zeros((0, 4))}
-        return dataclasses.replace(
-            self, compliance=(), yields=np.zeros(0), **round_gears
-        )
+        arm = dataclasses.replace(self, compliance=(), yields=np.zeros(0))
+        return dataclasses.replace(arm, harmonics=(), waves=np.zeros((0, 4)))
 
     def together(
         self, *tables: tuple[ArrayLike, ArrayLike | None]
@@ -436,45 +425,6 @@ class SerialChain(Arm, Model):
 
     def default_noise(self) -> Noise:
         return Noise(std=self.sensor.stds(self.length or 1.0))
-
-    def default_prior(self) -> Prior:
-        """Loose knowledge of any arm, by the length of its links; see the constants.
-
-        What the sensor cannot see is held; the groups' scales are taken from the
-        readings.
-        """
-        length = self.length or np.inf  # axes of unknown stroke alone
-        joint = [_LENGTH * length, _TWIST, _LENGTH * length, _ZERO, _TWIST]
-        mounting = [_MOUNTING * length] * 3 + [_MOUNTING_ANGLE] * 3
-        tool = [self.sensor.members[0].mounting * length] * 3 + [_MOUNTING_ANGLE] * 3
-        torque = length * sum(abs(weight) for _, weight, _ in self.loads)
-        std = [
-            *joint * len(self.joints),
-            *[_GEAR] * len(self.gears),
-            *[_SAG / torque if torque else np.inf] * len(self.compliance),
-            *mounting,
-            *(tool[i] for i in self._tool),
-            *self.sensor.prior_std(length),
-            *[_WAVE] * self.waves.size,
-        ]
-        return Prior(std, fixed=self.sensor.unseen(self), by_data=True)
-
-    def parameter_sizes(self) -> Array:
-        """(p,) of the default prior; where it says nothing the arm's length, a radian:
-        where things stand is no size."""
-        sizes = super().parameter_sizes()
-        unknown = self.default_prior().resolve(self).precisions == 0.0
-        units = np.array(self.units)
-        sizes[unknown & (units == "length")] = self.length or np.nan
-        sizes[unknown & (units == "deg")] = np.degrees(1.0)
-        return sizes
-
-    def error_groups(self) -> ErrorGroups:
-        """Lengths, turns of the axes, zeros of the joints, compliance, harmonics."""
-        members = np.full(len(self.names), -1)
-        members[self._at["table"]] = np.tile([0, 1, 0, 2, 1], len(self.joints))
-        members[self._at["compliance"]], members[self._at["harmonics"]] = 3, 4
-        return ErrorGroups(members, np.array(_SIZES), np.array(_SIZES_SPREAD))
 
     @property
     def placed(self) -> tuple[str, ...]:

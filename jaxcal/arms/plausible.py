@@ -162,8 +162,8 @@ def _require_in_picture(board: Board, pixels: Array, length: float) -> None:
             f"corners must be in the camera's picture of {size[0]:g} by {size[1]:g} "
             f"pixels, but {count} of {len(spots)} board rows have some outside: corner "
             f"{corner + 1} of row {row} is at {in_words(spots[row, corner])}. Is the "
-            "width first, and is it this camera? If the corners were undistorted, give "
-            "distortion=(k1, k2, p1, p2), of this camera and in OpenCV's order"
+            "width first, and is it this camera? Of a wide lens, whose undistorted "
+            "corners leave the picture, give camera=(fx, fy, cx, cy)"
         )
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from jaxcal.arms.effects import Fit as Calibration
 
 
-_FORMS = (".yaml", ".yml", ".sh", ".py", ".urdf")
+_FORMS = (".yaml", ".yml", ".sh", ".urdf")
 _METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 
 
@@ -140,8 +140,8 @@ def to_transform(
     Args:
         calibration: of an arm with ``Board``.
         path: .yaml, a geometry_msgs/TransformStamped; .sh, a call of ROS 2's
-            static_transform_publisher; .py, a launch file of that; .urdf, the arm's own
-            file with the frame as a link and its fixed joint.
+            static_transform_publisher; .urdf, the arm's own file with the frame as a
+            link and its fixed joint.
         child, parent, camera: as of ``static_transform``.
         force: write over a file that is there.
 
@@ -182,18 +182,5 @@ def _text(form: str, pose: StaticTransform) -> str:
         )
     words = [word for key in keys for word in (f"--{key}", values[key])]
     words += ["--frame-id", pose.parent, "--child-frame-id", pose.child]
-    if form == ".sh":
-        call = " ".join(words)
-        return f"# {pose}\nros2 run tf2_ros static_transform_publisher {call}\n"
-    return (
-        f"# {pose}\nfrom launch import LaunchDescription\n"
-        "from launch_ros.actions import Node\n\n\n"
-        "def generate_launch_description():\n"
-        f"    arguments = {words!r}\n"
-        "    node = Node(\n"
-        '        package="tf2_ros",\n'
-        '        executable="static_transform_publisher",\n'
-        "        arguments=arguments,\n"
-        "    )\n"
-        "    return LaunchDescription([node])\n"
-    )
+    call = " ".join(words)
+    return f"# {pose}\nros2 run tf2_ros static_transform_publisher {call}\n"

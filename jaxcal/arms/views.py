@@ -147,9 +147,6 @@ def in_picture(arm: Chain, commands: Array, view: View) -> tuple[Array, list[str
     spots = sensor.outline @ np.matrix_transpose(rotation) + place[:, None]
     rays = spots[..., :2] / np.maximum(spots[..., 2:], 1e-9)
     inside = spots[..., 2] > 0.0
-    if np.array_equal(view.camera, sensor.camera):  # of which the lens is known
-        rays, seen = sensor.bent(rays)
-        inside &= seen
     u, v = _FOCAL * fx * rays[..., 0], _FOCAL * fy * rays[..., 1]
     edge = _EDGE * width
     inside &= (u > edge - cx) & (u < width - edge - cx) & (v > edge - cy)

@@ -58,8 +58,8 @@ class SavedFiles:
     transform: Annotated[
         str,
         "--sensor board: write the camera's pose for the uncorrected arm, as a "
-        "TransformStamped (.yaml), ROS 2's static_transform_publisher (.sh, or .py to "
-        "launch it), or the .urdf with the camera's link",
+        "TransformStamped (.yaml), ROS 2's static_transform_publisher (.sh), or the "
+        ".urdf with the camera's link",
         "FILE",
     ] = ""
     frames: Annotated[

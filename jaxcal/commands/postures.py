@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jaxcal.arguments import several
 from jaxcal.arms import SerialChain
 from jaxcal.arms.sensors import SENSORS, Board, Landmarks
-from jaxcal.checks import Array, aligned, one_of
+from jaxcal.checks import aligned, one_of
 from jaxcal.commands.arms import ArmOptions
 from jaxcal.commands.tables import Output
 from jaxcal.extras import needs
@@ -97,11 +97,6 @@ def postures(
         "FILE",
     ] = None,
     count: Annotated[int, "number of postures to choose from"] = 300,
-    one_side: Annotated[
-        float | None,
-        "add columns `from JOINT`: start every move this many degrees below, so that "
-        "the backlash is always on the same side",
-    ] = None,
     seed: Annotated[int, "seed of the random draws"] = 0,
     picture: Annotated[
         pathlib.Path | None, "draw the arm at each chosen posture: .png, .pdf, .svg"
@@ -157,30 +152,13 @@ def postures(
 
         figure = Figure((8, 2.2 * -(-len(plan) // 4)), layout="constrained")
         plots.postures(figure, arm, plan).savefig(picture)
-    header, rows = _rows_of(arm, plan, one_side, of_arm.radians)
+    if of_arm.radians:
+        turning = np.flatnonzero(np.array(arm.command_units) == "deg")
+        plan[:, turning] = np.radians(plan[:, turning])
+    rows = plan.tolist()
     if not output.written(header, rows):
         cells = [[f"{i + 1}", *(f"{x:.4g}" for x in r)] for i, r in enumerate(rows)]
         print("\n".join(aligned([["", *header], *cells])))
-
-
-def _rows_of(
-    arm: SerialChain, plan: Array, one_side: float | None, radians: bool
-) -> tuple[tuple[str, ...], list[list[float]]]:
-    """The names of the columns of a plan (N, n), and its rows.
-
-    ``one_side``: degrees below each posture where its joints come from, which are then
-    columns too.
-    """
-    header = (*arm.joint_names, *arm.sensor.inputs)
-    turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
-    if one_side is not None:
-        start, width = arm.from_one_side(plan, one_side), plan.shape[1]
-        header = (*header, *(f"from {name}" for name in arm.joint_names))
-        turning += [width + i for i in turning]
-        plan = np.hstack([plan, start])
-    if radians:
-        plan[:, turning] = np.radians(plan[:, turning])
-    return header, plan.tolist()
 
 
 def _worth(design: Design, chosen: NDArray[np.int_], seed: int) -> str:

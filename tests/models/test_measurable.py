@@ -87,57 +87,6 @@ def test_corners_outside_the_picture_are_named():
         arm.prepared(aside)
 
 
-def test_corners_of_a_wide_lens_are_judged_with_its_distortion():
-    """Of 71 degrees with k1 = -.3: its edge, taken out, is a tenth outside."""
-    lens, size, fx = np.array([640.0, 480.0]), np.array([1280.0, 960.0]), 900.0
-    terms = (-0.3, 0.06, 1e-3, -2e-3)
-    k1, k2, p1, p2 = terms
-
-    def bent(rays):  # OpenCV's formula, written out
-        x, y = rays.T
-        r = np.hypot(x, y) ** 2
-        u = x * (1 + k1 * r + k2 * r**2) + 2 * p1 * x * y + p2 * (r + 2 * x**2)
-        v = y * (1 + k1 * r + k2 * r**2) + p1 * (r + 2 * y**2) + 2 * p2 * x * y
-        return np.column_stack([u, v])
-
-    rng = np.random.default_rng(0)
-    measured = np.vstack([rng.uniform(0.0, size, (200, 2)), [[0.0, 480.0]]])
-    rays = start = (measured - lens) / fx
-    for _ in range(200):  # distortion taken out
-        rays = rays + start - bent(rays)
-    np.testing.assert_allclose(bent(rays), start, atol=1e-9)
-    straight = fx * rays + lens
-    assert straight[-1, 0] < -0.1 * size[0]
-    board = Board(corners=CORNERS, camera=(*size, fx, fx, *lens), distortion=terms)
-    assert board.in_picture(straight, 1e-6).all()
-    outside = (straight < 0.0) | (straight > size)
-    plain = Board(corners=CORNERS, camera=board.camera)
-    np.testing.assert_array_equal(plain.in_picture(straight), ~outside.any(axis=1))
-    farther = lens + (straight - lens) * (1.0 + 0.05)
-    there = fx * bent((farther - lens) / fx) + lens
-    wanted = (there >= 0.0).all(axis=1) & (there <= size).all(axis=1)
-    np.testing.assert_array_equal(board.in_picture(farther), wanted)
-    assert not wanted.all()
-    folded = Board(corners=CORNERS, camera=board.camera, distortion=(-0.3, 0, 0, 0))
-    back = lens + np.array([1.8 * fx, 0.0])  # which 1.8 - .3 * 1.8**3 puts at .05
-    assert not folded.in_picture(back)
-    with pytest.raises(ValueError, match=r"distortion must be \(k1"):
-        Board(corners=CORNERS, camera=board.camera, distortion=(0.1,))
-
-
-@pytest.mark.slow
-def test_views_are_planned_for_the_lens():
-    """One that has what is near the corners a third farther out than without it."""
-    lens = Board("camera", PLACE, CORNERS, CAMERA, distortion=(0.6, 0.0, 0.0, 0.0))
-    arm = SerialChain.from_dh(ur5().table, tool=MOUNT, sensor=lens)
-    joints = arm.postures(6, seed=1, distance=(160.0, 230.0))
-    seen = np.linalg.inv(_frames(arm, joints, arm.nominal)) @ PLACE
-    spots = CORNERS @ np.matrix_transpose(seen[:, :3, :3]) + seen[:, None, :3, 3]
-    rays = spots[..., :2] / spots[..., 2:]
-    pixels = 900.0 * rays * (1.0 + 0.6 * (rays**2).sum(axis=-1, keepdims=True))
-    assert (np.abs(pixels) < [640.0, 480.0]).all()
-
-
 def _at_left(pixels, row, share):
     """Pixels (N, C, 2) of a row moved until its leftmost is at a share of the width."""
     moved = pixels.copy()

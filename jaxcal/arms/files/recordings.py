@@ -62,7 +62,7 @@ def recorded(arm: Chain, recording: Recording) -> tuple[Array, Array | None]:
             readings.
         MissingExtraError: what reads it is not installed.
     """
-    sensor = arm.sensor
+    sensor, which = arm.sensor, recording.which or ()
     views = sensor.views and sensor.zeros
     if not views and tuple(sensor.inputs) not in ((), (sensor.kind,)):
         raise ValueError(
@@ -80,7 +80,6 @@ def recorded(arm: Chain, recording: Recording) -> tuple[Array, Array | None]:
         turns = Rotation.from_matrix(matrices).as_rotvec(degrees=True)
         commands = np.column_stack([commands, read[:, :3], turns])
     elif sensor.inputs:
-        which = () if recording.which is None else recording.which
         if len(which) != len(commands):
             raise ValueError(
                 f"which must give the {sensor.kind} of each of the {len(commands)} "
@@ -100,20 +99,17 @@ def _rests_of(
     """Means of the joints (N, J) where the arm stood still, in degrees and lengths, and
     of the messages (N, r) for a ``kind`` of sensor, None for ""."""
     names, turning = arm.joint_names, np.array(arm.command_units) == "deg"
-    columns = {name: recording.names.get(name, name) for name in names}
-    path = pathlib.Path(recording.path)
+    columns = [recording.names.get(name, name) for name in names]
+    path, messages = pathlib.Path(recording.path), None
     if (path / "meta" / "info.json").is_file():
-        parts, messages = _dataset(path, [*columns.values()], recording.servos), None
+        parts = _dataset(path, columns, recording.servos)
     else:
         if recording.servos is not None:
             raise ValueError(f"servos needs a LeRobot dataset: {path} is none")
-        times, joints, messages = _bag(path, [*columns.values()], kind, recording.topic)
+        times, joints, messages = _bag(path, columns, kind, recording.topic)
         parts = [(times, np.where(turning, np.degrees(joints), joints))]
-    tables, spans = zip(
-        *(rests(*part, recording.seconds, recording.within) for part in parts),
-        strict=True,
-    )
-    postures = np.concatenate(tables)
+    both = [rests(*part, recording.seconds, recording.within) for part in parts]
+    postures, spans = (np.concatenate(of_parts) for of_parts in zip(*both, strict=True))
     if not len(postures):
         raise ValueError(
             f"{path} has no {recording.seconds:g} s of rest: the joints jitter by "
@@ -124,7 +120,7 @@ def _rests_of(
         return postures, None
     at, values = messages
     readings = []
-    for number, (first, last) in enumerate(np.concatenate(spans)):
+    for number, (first, last) in enumerate(spans):
         there = (at >= first) & (at <= last)
         if not there.any():
             raise ValueError(f"{path}: rest {number} has no reading of the sensor")
@@ -292,16 +288,15 @@ def rests(
         most = np.maximum(most, _JITTER * noise)
     resting: list[Array] = []
     spans: list[tuple[float, float]] = []
-    first = 0
-    low, high = joints[0], joints[0]
+    first, low, high = 0, joints[0], joints[0]
     for i in range(1, len(joints) + 1):
         if i < len(joints):
             wider = np.minimum(low, joints[i]), np.maximum(high, joints[i])
             if (wider[1] - wider[0] <= most).all():
                 low, high = wider
                 continue
+        stretch = joints[first:i]
         if times[i - 1] - times[first] >= seconds:
-            stretch = joints[first:i]
             third = -(-len(stretch) // 3)
             drift = stretch[-third:].mean(axis=0) - stretch[:third].mean(axis=0)
             slack = _WITHIN + 4.0 * noise * np.sqrt(2.0 / third)
@@ -341,10 +336,10 @@ class Servos:
         if not self.motors:
             raise ValueError("motors must hold at least one motor")
         for name, motor in self.motors.items():
-            whole = isinstance(motor, Mapping) and all(
-                isinstance(motor.get(key), int) for key in _KEYS
+            numbers = (
+                [motor.get(x) for x in _KEYS] if isinstance(motor, Mapping) else [""]
             )
-            if not whole:
+            if not all(isinstance(number, int) for number in numbers):
                 raise ValueError(
                     f"motor {name} must have {', '.join(_KEYS)}, whole numbers, "
                     f"got {motor!r}"
@@ -358,9 +353,8 @@ class Servos:
     @classmethod
     def load(cls, path: str | os.PathLike[str], resolution: int = 4096) -> Self:
         """Read the file that ``lerobot-calibrate`` wrote."""
-        text = pathlib.Path(path).read_text(encoding="utf-8-sig")
         try:
-            content = json.loads(text)
+            content = json.loads(pathlib.Path(path).read_text(encoding="utf-8-sig"))
             if not isinstance(content, dict):
                 raise ValueError("it must hold motors by name")
             return cls(content, resolution)
@@ -437,14 +431,13 @@ def write_servos(
         Steps by which the middle of each motor's range moved.
     """
     theta = as_parameters(arm, parameters)
-    rows = (theta - arm.nominal)[: arm.table.size].reshape(arm.table.shape)
+    zeros = (theta - arm.nominal)[: arm.table.size].reshape(arm.table.shape)[:, 3]
     ahead = {}
-    for k, (name, unit) in enumerate(
-        zip(arm.joint_names, arm.command_units, strict=True)
-    ):
+    for k, name in enumerate(arm.joint_names):
         moved = np.flatnonzero(arm.drive[:, k])
-        if unit == "deg" and len(moved) == 1:
-            ahead[names.get(name, name)] = rows[moved[0], 3] / arm.drive[moved[0], k]
+        if arm.command_units[k] == "deg" and len(moved) == 1:
+            by_column = arm.drive[moved[0], k]
+            ahead[names.get(name, name)] = zeros[moved[0]] / by_column
     old = Servos.load(servos)
     new = old.moved(ahead)
     new.save(path, force=force)

@@ -110,9 +110,9 @@ def write(
     bent = np.flatnonzero(waves.any(axis=1))
     lost += [f"harmonics of joint {arm.harmonics[i]}" for i in bent]
     if lost:
+        what = ", ".join(lost)
         warnings.warn(
-            f"{', '.join(lost)} left out: the file cannot hold compliance and gear "
-            "harmonics",
+            f"{what} left out: the file cannot hold compliance and gear harmonics",
             stacklevel=2,
         )
     one_of("form", form, ("urdf", "dh", "ur"))
@@ -274,12 +274,11 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
     lines = ["kinematics:"]
     for name, frame, zero in zip(UR, frames, nominal.offset, strict=True):
         pose = pose_words(frame @ row_matrix(np.array([0.0, 0.0, 0.0, zero, 0.0])))
-        values = [*pose["xyz"].split(), *pose["rpy"].split()]
+        values = f"{pose['xyz']} {pose['rpy']}".split()
         keys = ("x", "y", "z", "roll", "pitch", "yaw")
         pairs = zip(keys, values, strict=True)
         lines += [f"  {name}:", *(f"    {key}: {value}" for key, value in pairs)]
-    lines.append("  hash: calibrated_by_jaxcal")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "  hash: calibrated_by_jaxcal", ""])
 
 
 def _steps(nominal: Arm, calibrated: Arm) -> tuple[list[list[_Part]], list[Array]]:
@@ -350,14 +349,10 @@ def pose_words(matrix: Array) -> dict[str, str]:
     turn = matrix[:3, :3]
     yaw = np.arctan2(turn[1, 0], turn[0, 0])
     pitch = np.arctan2(-turn[2, 0], np.hypot(turn[0, 0], turn[1, 0]))
-    c, s = np.cos(yaw), np.sin(yaw)
-    across = np.array([-s, c, 0.0])  # the y axis before the roll
+    across = np.array([-np.sin(yaw), np.cos(yaw), 0.0])  # the y axis before the roll
     roll = np.arctan2(-(across @ turn[:, 2]), across @ turn[:, 1])
-    words = [
-        " ".join(repr(float(value)) for value in values)
-        for values in (matrix[:3, 3], (roll, pitch, yaw))
-    ]
-    return {"xyz": words[0], "rpy": words[1]}
+    values = {"xyz": matrix[:3, 3].tolist(), "rpy": [roll, pitch, yaw]}
+    return {key: " ".join(repr(float(x)) for x in row) for key, row in values.items()}
 
 
 def with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str:
@@ -367,10 +362,10 @@ def with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str
         raise ValueError(
             "the URDF file is in UTF-16, which cannot be written: save it as UTF-8"
         )
-    places, last, encoding = _places(data)
+    places, last = _places(data)
     newline = "\r\n" if "\r\n" in text else "\n"
     more = more.replace("\n", newline)
-    edits = [(last, last, more.encode(encoding, "xmlcharrefreplace"))]
+    edits = [(last, last, more.encode("ascii", "xmlcharrefreplace"))]
     for name, matrix in origins.items():
         pose = pose_words(matrix)
         joint, origin = places[name]
@@ -401,41 +396,33 @@ def with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str
     return text
 
 
-def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int, str]:
+def _places(data: bytes) -> tuple[dict[str, tuple[int, int | None]], int]:
     """For each joint of a URDF file where its tag and its origin's begin, in bytes; the
-    end of the robot; the encoding."""
+    end of the robot."""
     parser = expat.ParserCreate()
     path: list[str] = []
     places: dict[str, tuple[int, int | None]] = {}
-    name, last, encoding = "", 0, "utf-8"
-
-    def declared(_version: str, of_file: str | None, _alone: int) -> None:
-        nonlocal encoding
-        encoding = of_file or encoding
+    last = 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal name
         path.append(tag)
         if path == ["robot", "joint"]:
-            name = attributes["name"]
-            places[name] = (parser.CurrentByteIndex, None)
-        elif path == ["robot", "joint", "origin"] and places[name][1] is None:
-            places[name] = (places[name][0], parser.CurrentByteIndex)
+            places[attributes["name"]] = (parser.CurrentByteIndex, None)
+        elif path == ["robot", "joint", "origin"]:
+            name = [*places][-1]
+            if places[name][1] is None:
+                places[name] = (places[name][0], parser.CurrentByteIndex)
 
-    def end(tag: str) -> None:
+    def end(_tag: str) -> None:
         nonlocal last
         path.pop()
         last = parser.CurrentByteIndex
 
-    parser.XmlDeclHandler = declared
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
+    parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.Parse(data, True)
-    return places, last, encoding
+    return places, last
 
 
 def _end_of_tag(data: bytes, start: int) -> int:
     """One after the > of the tag that begins at ``start``."""
-    tag = _TAG.match(data, start)
-    assert tag is not None  # the file was parsed
-    return tag.end()
+    return _TAG.match(data, start).end()  # type: ignore[union-attr]  # it was parsed

@@ -13,7 +13,6 @@ __all__ = [
     "Flush",
     "Gravity",
     "Landmarks",
-    "Placed",
     "Plane",
     "Pose",
     "Position",
@@ -25,8 +24,6 @@ __all__ = [
     "Wrench",
     "hats",
 ]
-
-Placed = Landmarks  # as it was called in 0.2
 
 # By their names in files and on the command line; a sensor of one's own is added here.
 _KINDS = (Position, Pose, Socket, Plane, Flush, Distance, Gravity, Wrench, Board)

@@ -54,9 +54,6 @@ class Board(Sensor):
             points away; 0 is not known, views tell.
         extent: width and height of a board without corners from its origin, to plan
             views.
-        distortion: OpenCV's (k1, k2, p1, p2) or with k3, by which a corner that is
-            outside without it is known to be in the picture. Corners are corrected by
-            it already.
         same_board: in ``Several``, this camera stands and sees the board on the tip
             that the first of them sees.
         intrinsics: of ``corners``, focal lengths and centre are unknowns too, known to
@@ -69,7 +66,6 @@ class Board(Sensor):
     camera: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     side: float = 0.0
     extent: tuple[float, float] = (0.0, 0.0)
-    distortion: tuple[float, ...] = ()
     same_board: bool = False
     intrinsics: bool = False
 
@@ -105,13 +101,6 @@ class Board(Sensor):
             raise ValueError("intrinsics needs a board with corners")
         if self.same_board and self.moves != "board":
             raise ValueError('same_board needs a fixed camera: moves="board"')
-        distortion = numbers("distortion", self.distortion)
-        if distortion.shape not in ((0,), (4,), (5,)):
-            raise ValueError(
-                "distortion must be (k1, k2, p1, p2) or with k3, got "
-                f"{self.distortion!r}"
-            )
-        object.__setattr__(self, "distortion", tuple(distortion.tolist()))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -135,24 +124,8 @@ class Board(Sensor):
     def in_picture(self, spots: Array, margin: float = 0.0) -> NDArray[np.bool_]:
         """(...) whether pixels (..., 2) without distortion are in the camera's picture,
         or up to ``margin`` pixels outside of it."""
-        focal, centre = self.lens
-        bent, seen = self.bent((spots - centre) / focal)
-        pixels = focal * bent + centre
-        inside = (pixels >= -margin) & (pixels <= np.array(self.picture) + margin)
-        return np.asarray(seen & inside.all(axis=-1))
-
-    def bent(self, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Rays (..., 2), x and y by depth, as the lens bends them; (...) of those that
-        it sees, before its polynomial turns back."""
-        k1, k2, p1, p2, k3 = (*self.distortion, *[0.0] * 5)[:5]
-        x, y = rays[..., 0], rays[..., 1]
-        square = x**2 + y**2
-        stretch = 1.0 + square * (k1 + square * (k2 + square * k3))
-        across = 2.0 * np.stack([p1 * x * y + p2 * x**2, p1 * y**2 + p2 * x * y], -1)
-        aside = across + square[..., None] * np.array([p2, p1])
-        turns = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
-        ends = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0.0)]
-        return rays * stretch[..., None] + aside, square < ends.min(initial=np.inf)
+        inside = (spots >= -margin) & (spots <= np.array(self.picture) + margin)
+        return np.asarray(inside.all(axis=-1))
 
     @property
     def outline(self) -> Array:

@@ -112,13 +112,14 @@ class Sensor(abc.ABC):
     # readings hardly show it and would put it anywhere.
     mounting: ClassVar[float] = 0.1
     misfit: ClassVar[float] = 0.0  # what they leave, by the arm's length, in a choice
+    # What follows a property may give.
+    inputs: ClassVar[Any] = ()  # columns of the commands after the joints
+    names: ClassVar[Any] = ()  # s of its own parameters
+    units: ClassVar[Any] = ()  # s: "length", "deg" and the like
+    num_places: ClassVar[Any] = 0  # sockets, planes or anchors around the arm
+    mounted: ClassVar[Any] = True  # in ``Several`` it has its own place on the tool
     # (q,) of readings that wrap, 360 of an angle in degrees, inf of the others.
     periods: ClassVar[tuple[float, ...] | None] = None
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Columns of the commands after the joints."""
-        return ()
 
     @property
     @abc.abstractmethod
@@ -129,16 +130,6 @@ class Sensor(abc.ABC):
     def quantities(self) -> tuple[Quantity, ...]:
         """What it reads, by unit; "length" stands for the unit of the arm's lengths."""
         return (Quantity("length" if self.lengths else ""),)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """s names of its own parameters."""
-        return ()
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """s units: "length", "deg" and the like."""
-        return ()
 
     @property
     def nominal(self) -> Array:
@@ -177,11 +168,6 @@ class Sensor(abc.ABC):
         """This sensor, its place found by another arm: what ``located`` has to find."""
         return self
 
-    @property
-    def num_places(self) -> int:
-        """Sockets, planes or anchors that stand around the arm."""
-        return 0
-
     def of_rows(self, inputs: Array) -> NDArray[np.int64]:
         """(N,) which of the things that stand around each row is of."""
         return np.zeros(len(inputs), dtype=np.int64)
@@ -189,11 +175,6 @@ class Sensor(abc.ABC):
     def lacking(self, inputs: Array) -> tuple[int, ...]:
         """Things of which something is known and none of the rows (N, e) is."""
         return ()
-
-    @property
-    def mounted(self) -> bool:
-        """Whether in ``Several`` it has a place of its own on the tool."""
-        return True
 
     @property
     def contacts(self) -> bool:
@@ -257,7 +238,8 @@ class Sensor(abc.ABC):
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Self:
         """The sensor that ``to_dict`` wrote."""
-        return cls(**{key: content[key] for key in content if key != "kind"})
+        gone = ("kind", "distortion")  # a board's, which only 0.2 used
+        return cls(**{key: content[key] for key in content if key not in gone})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
