@@ -100,7 +100,6 @@ class Chains(Model):
         it carries. The others yield as those of an arm alone do.
 
         Args:
-            path: the file.
             sensors: of each tip link; one object for two tips stands once.
             base, locked, limits: as of ``SerialChain.from_urdf``, of joints of any
                 chain.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.sensors import Sensor, Socket, Wrench
-from jaxcal.calibration.verdict import Reason, outlying
+from jaxcal.calibration.verdict import Reason, in_rows, outlying
 from jaxcal.checks import Array
 
 if TYPE_CHECKING:
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 
 MORE = "measure more postures: jaxcal postures --measured chooses them"
+LOOK = (
+    "look at the residuals (report, --report); use the nominal machine until they are "
+    "explained"
+)
 CLEAR_UP = "fix the problems listed above, then run identify again"
 _FAR = 4.0  # standard deviations of the prior
 _MOVED = 3.0  # times the scatter of a socket's contacts: it was moved
@@ -83,18 +87,6 @@ def unit_after(fit: Fit) -> str:
     return f" {unit}" if unit else ""
 
 
-class Findings(NamedTuple):
-    """What speaks against a calibration, and the sentences that say it."""
-
-    reasons: tuple[str, ...]
-    mistaken: bool  # columns of joints are reversed or exchanged
-    exchanged: bool  # so are sockets
-    moved: str  # kind of what seems to have moved: socket, plane
-    contradicting: tuple[int, ...]  # measurements that contradict the others
-    doubtful: bool  # the readings or the description of the arm may be wrong
-    remedy: str  # of the doubt
-
-
 def findings_of(
     fit: Fit,
     used: NDArray[np.intp],
@@ -103,12 +95,14 @@ def findings_of(
     mistaken: str,
     anywhere: float,
     nominal: float,
-) -> Findings:
-    """What is wrong, by name, of the rows ``used`` (K,).
+    more: bool,
+) -> tuple[tuple[str, ...], bool, str]:
+    """What is wrong, by name, of the rows ``used`` (K,); whether nothing is that casts
+    doubt on readings or description; what to do about a calibration that is not good.
 
     ``scatter`` is what the noise does not explain, ``mistaken`` what was said of
     columns, ``anywhere`` the tip's standard deviation, ``nominal`` its error as
-    described.
+    described; ``more`` measurements may help.
     """
     model = fit.model
     swapped: dict[int, int] = {}
@@ -118,24 +112,23 @@ def findings_of(
     limit = _LOOSE if len(used) > _SPARSE else 0.0
     of_noise = scatter is not None and fit.noise_known  # all rows are far off
     outliers = [] if of_noise else [*fit.outliers]
-    far = (fit.distance[outliers] > limit**2).any()
-    contradicting: tuple[int, ...] = ()
+    contradicting: list[int] = []
     reasons = _wrong_rows(fit, used, parts, swapped, outliers)
     if scatter:
         reasons.insert(0, scatter.fact)
-    if swapped or exchanged or far:
+    if swapped or exchanged or (fit.distance[outliers] > limit**2).any():
         reasons.insert(0, "some readings contradict the others")
-        contradicting = tuple(sorted({*swapped, *outliers}))
+        contradicting = sorted({*swapped, *outliers})
     moved = {part.kind: _moved(fit, part, swapped) for part in parts}
-    moved_lines = [line for lines in moved.values() for line in lines]
+    kind = next((kind for kind, lines in moved.items() if lines), "")
     tip, doubtful = _other_tip(fit, model)
     other_arm = [] if mistaken else _other_links(fit, parts)
     apart, wrong = (
         ([], False) if other_arm else other_distances(fit, parts, model.length)
     )
     still, unused = _still(model, fit.commands[used])
-    reasons += moved_lines + exchanged + _far(fit)
-    reasons += tip + other_arm + apart + still + _kept(fit)
+    reasons += [line for lines in moved.values() for line in lines]
+    reasons += exchanged + _far(fit) + tip + other_arm + apart + still + _kept(fit)
     reasons += [
         f"The readings show a mass of {fit.parameters[part.own][0]:.3g} kg. If "
         "the controller subtracts a payload, this is the load less that payload: set "
@@ -147,16 +140,30 @@ def findings_of(
     doubtful |= bool(contradicting or exchanged or other_arm)
     vague = left_open(parts, unit_after(fit), anywhere, nominal)
     reasons += [vague.fact] if vague else []
-    return Findings(
-        # What the fit made of mistaken columns is no reason.
-        (mistaken,) if mistaken else tuple(reasons),
-        bool(mistaken),
-        bool(exchanged),
-        next((kind for kind, lines in moved.items() if lines), ""),
-        contradicting,
-        doubtful or vague is not None,
-        vague.remedy if vague and not doubtful else CLEAR_UP,
+    residuals = scatter.remedy if scatter else LOOK
+    steps = (
+        (mistaken, "correct the columns, then identify again"),
+        (exchanged, "look at the sockets' columns"),
+        (of_noise, residuals),
+        (
+            contradicting,
+            f"look at {in_rows(contradicting)} (counted from 0): correct, repeat or "
+            "leave out",
+        ),
+        (
+            kind and scatter,
+            f"measure again with the {kind} fixed, or number it as two: before and "
+            "after it moved",
+        ),
+        (doubtful, CLEAR_UP),
+        (vague, vague.remedy if vague else ""),
+        (more, MORE),
+        (True, residuals),
     )
+    step = next(step for holds, step in steps if holds)
+    clean = not (doubtful or vague or (kind and scatter))
+    # What the fit made of mistaken columns is no reason.
+    return (mistaken,) if mistaken else tuple(reasons), clean, step
 
 
 def left_open(

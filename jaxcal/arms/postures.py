@@ -32,22 +32,15 @@ def postures(arm: Chain, count: int, *, seed: int = 0, **rules: Any) -> Array:
     kinematics from random starts, a redundant arm's self-motions among them.
 
     Args:
-        arm: with its sensor.
-        count: how many.
-        seed: of the random starts.
         near: rough places: (S, 3) sockets or (S, 4) planes if the sensor has no places;
-            for a sensor that reads everywhere rows (x, y, z, radius), of which the tip
-            must be near one; not for a board.
+            for a sensor that reads everywhere rows (x, y, z, radius) for the tip.
         allowed: function of joints (J,), False where they collide.
         camera: of a board, (width, height, fx, fy, cx, cy) in pixels, or a field of
-            view in degrees (horizontal, vertical): every corner is in the picture, with
-            a focal length that is known to a tenth.
+            view in degrees (horizontal, vertical): every corner is in the picture.
         distance: least and greatest, of the board's middle from that camera; by default
             the board fills 25 to 80 % of the picture.
-        tilt: degrees that the board's face may be turned from the camera, by default
-            45.
-        floor: lowest height (z in the measuring frame) of joints, and of sockets within
-            1 % of the arm's length.
+        tilt: degrees that the board's face may be turned from the camera (45).
+        floor: lowest height (z in the measuring frame) of joints and sockets.
         approach: direction (x, y, z) of the tool's approach, from the last joint to the
             tip, and the largest angle from it in degrees (60).
 

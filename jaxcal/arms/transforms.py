@@ -65,7 +65,6 @@ def static_transform(
     controller goes by: beside a corrected arm the camera is the tip of ``to_urdf``.
 
     Args:
-        calibration: of an arm with ``Board``.
         child: name of the camera's optical frame (z ahead, x to the right in the
             picture, not a driver's camera_link); by default "camera_optical_frame".
         parent: link that it is in; by default a URDF file's tip link, or the base of a
@@ -138,7 +137,6 @@ def to_transform(
     """Write ``static_transform`` as what reads it.
 
     Args:
-        calibration: of an arm with ``Board``.
         path: .yaml, a geometry_msgs/TransformStamped; .sh, a call of ROS 2's
             static_transform_publisher; .urdf, the arm's own file with the frame as a
             link and its fixed joint.

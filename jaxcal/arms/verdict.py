@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
 from jaxcal.arms.findings import (
-    MORE,
-    Findings,
+    LOOK,
     Part,
     findings_of,
     parts_of,
@@ -30,7 +29,6 @@ from jaxcal.calibration import verdict as models
 from jaxcal.calibration.verdict import (
     Reason,
     computed,
-    in_rows,
     left_out,
     never_measured,
     wrong_noise,
@@ -40,11 +38,6 @@ from jaxcal.information.singular import depends, significant
 
 if TYPE_CHECKING:
     from jaxcal.arms.effects import Fit
-
-_LOOK = (
-    "look at the residuals (report, --report); use the nominal machine until they are "
-    "explained"
-)
 
 _LITTLE = 1.0 / 3.0  # of the nominal error: so little left is worth having anyway
 _LOUD, _WILD = 10.0, 100.0  # times the usual noise
@@ -188,13 +181,17 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
         mistaken = mistaken_columns(model, commands, measured)
     first, anywhere = _anywhere(fit, model, parts)
     nominal = next(one.nominal for one in errors if one.of == first.title)
-    findings = findings_of(fit, used, parts, scatter, mistaken, anywhere, nominal)
-    clean = not (findings.doubtful or (findings.moved and not explains))
+    accuracy = fit.provenance.get("accuracy")
+    if isinstance(accuracy, float):  # of a file of 0.2
+        accuracy = {errors[0].unit: accuracy}
+    more = accuracy is not None or helps is None
+    reasons, clean, step = findings_of(
+        fit, used, parts, scatter, mistaken, anywhere, nominal, more
+    )
     place = None
     if all(part.sensor.views for part in parts):
         place = place_of(fit, [f"tool {axis}" for axis in Pose.tool])
     reach = model.length or float(np.ptp(parts[0].points, axis=0).max())
-    reasons = findings.reasons
     if place is not None and place.hidden:
         reasons += (
             f"{', '.join(place.hidden)}: not shown by these views, kept at the nominal "
@@ -205,9 +202,6 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
         unit_of_first = "" if errors[0].unit == "length" else f" {errors[0].unit}"
         effects = in_words(fit, unit_of_first) + play_in_words(fit)
         reasons += tuple(effects)
-    accuracy = fit.provenance.get("accuracy")
-    if isinstance(accuracy, float):  # of a file of 0.2
-        accuracy = {errors[0].unit: accuracy}
     if accuracy is not None:
         good = clean and not _missed(errors, accuracy)
     elif place is not None and place.std[0] < _PLACED * reach and explains:
@@ -215,8 +209,6 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
     else:
         little = ratio + half < _LITTLE and not _wild(fit)
         good = bool(clean and helps and (explains or little))
-    more = accuracy is not None or helps is None
-    step = _next_step(findings, scatter, fit.noise_known, more)
     return ArmVerdict(
         good=good,
         reasons=reasons,
@@ -283,32 +275,6 @@ def _sessions(fit: Fit, first: HeldOut) -> str:
     return f"Sessions differ by {size} (1 sigma); predictions include this."
 
 
-def _next_step(
-    findings: Findings, scatter: Reason | None, noise_known: bool, more: bool
-) -> str:
-    """What to do about a calibration that is not good; ``more`` may help."""
-    kind, residuals = findings.moved, scatter.remedy if scatter else _LOOK
-    steps = (
-        (findings.mistaken, "correct the columns, then identify again"),
-        (findings.exchanged, "look at the sockets' columns"),
-        (scatter and noise_known, residuals),
-        (
-            findings.contradicting,
-            f"look at {in_rows(findings.contradicting)} (counted from 0): correct, "
-            "repeat or leave out",
-        ),
-        (
-            findings.moved and scatter,
-            f"measure again with the {kind} fixed, or number it as two: before and "
-            "after it moved",
-        ),
-        (findings.doubtful, findings.remedy),
-        (more, MORE),
-        (True, residuals),
-    )
-    return next(step for holds, step in steps if holds)
-
-
 def _ratio(held_out: Array, off: Array) -> tuple[float, float]:
     """Mean of held-out errors (K, q) by the nominal arm's, and half of its 95 %
     interval."""
@@ -369,7 +335,7 @@ def _scattered(fit: Fit, usual: Array, parts: list[Part]) -> Reason | None:
         f"the readings scatter by {largest:.3g}{unit}, {times:.3g} times the usual "
         "scatter of this sensor: noise, or an effect that no parameter describes"
         + several,
-        _LOOK,
+        LOOK,
     )
 
 

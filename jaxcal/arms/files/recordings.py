@@ -38,12 +38,7 @@ def at_rest(
     """Postures (N, J) at which a recorded arm stood still, in their order.
 
     Args:
-        arm: whose joints are looked for.
-        path: rosbag2 folder (SQLite or MCAP) with joint states. Needs the extra
-            ``ros``.
-        seconds: of rest, at least.
-        within: degrees (or units of length) in which a resting joint stays. By default
-            0.05, or eight times what the joint's readings jitter by.
+        path, seconds, within: as of ``Recording``.
 
     Raises:
         ValueError: the arm never stood still; it says how the joints jitter.
@@ -425,10 +420,8 @@ def write_servos(
     """Write LeRobot's calibration file with the joints' zeros of ``parameters`` (p,).
 
     Of turning joints alone. ``servos`` is the file that is corrected, ``names`` are
-    motors whose names differ from the joints'.
-
-    Returns:
-        Steps by which the middle of each motor's range moved.
+    motors whose names differ from the joints'. Returns the steps by which the middle of
+    each motor's range moved.
     """
     theta = as_parameters(arm, parameters)
     zeros = (theta - arm.nominal)[: arm.table.size].reshape(arm.table.shape)[:, 3]

@@ -81,14 +81,12 @@ def write(
     warning.
 
     Args:
-        arm: the nominal one.
         form: "urdf" is the file that the arm came from, its origins corrected: all else
             stays as it is, and the tip goes where ``predict`` of positions puts it, the
             base in the measuring frame included. "dh" is the table as CSV: joint, a,
             alpha, d, theta (with the joint's offset), beta, without base, tool and
             convention; a warning names joints that follow others. "ur" is the YAML file
             of Universal Robots' ROS description, for six joints, without base and tool.
-        path: the file to write.
         parameters: (p,) as ``identify`` found them.
         force: overwrite an existing file.
 
