@@ -51,9 +51,9 @@ class SerialChain(Arm, Model):
     """
 
     # Of modules that know this one.
-    located = late("jaxcal.arms.located:located")
-    anew = late("jaxcal.arms.located:anew")
-    prepared = late("jaxcal.arms.located:prepared")
+    located = late("jaxcal.arms.plausible:located")
+    anew = late("jaxcal.arms.plausible:anew")
+    prepared = late("jaxcal.arms.plausible:prepared")
     require_commands = late("jaxcal.arms.plausible:require_commands")
     postures = late("jaxcal.arms.postures:postures")
     reachable = late("jaxcal.arms.postures:reachable")
@@ -340,10 +340,10 @@ class SerialChain(Arm, Model):
                 f"measured), got {len(tables)} pairs"
             )
         named = []
-        for i, (one, (given, read)) in enumerate(zip(sensors, tables, strict=True)):
+        for i, (one, pair) in enumerate(zip(sensors, tables, strict=True)):
             at = [j + self.sensor.inputs.index(name) for name in one.inputs]
             noise = one.stds(self.length)
-            named.append(OneTable(one.kind, i, [*range(j), *at], noise, given, read))
+            named.append(OneTable(one.kind, i, [*range(j), *at], noise, *pair))
         return stacked(named, j, self.num_inputs, self.num_outputs)
 
     def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:

@@ -47,9 +47,9 @@ class Chains(Model):
     """
 
     # Of modules that know this one.
-    prepared = late("jaxcal.arms.located:prepared_chains")
-    verdict = late("jaxcal.arms.chains_verdict:verdict_of_chains")
-    of_chain = late("jaxcal.arms.chains_verdict:of_chain")
+    prepared = late("jaxcal.arms.plausible:prepared_chains")
+    verdict = late("jaxcal.arms.verdict:verdict_of_chains")
+    of_chain = late("jaxcal.arms.verdict:of_chain")
     write = late("jaxcal.arms.files.write:write_chains")
 
     tips: tuple[str, ...]
@@ -128,7 +128,7 @@ class Chains(Model):
 
     @functools.cached_property
     def _firsts(self) -> list[int]:
-        """Of each chain the first one that has its base."""
+        """(C,) the first chain that has the base of each."""
         arms = self.chains
         return [
             next(j for j in range(k + 1) if j == k or common(arms[j], arms[k]))
@@ -164,10 +164,9 @@ class Chains(Model):
             zip(self.tips, self.chains, self._shared, strict=True)
         ):
             links = [f"{name}{i}" for i in range(1, shared) for name in COLUMNS]
-            of_all = {*links, *(BASE if shared else ())}
-            for i in range(1, shared + 1):
-                of_all |= {f"gear{i}", f"compliance{i}"}
-                of_all |= {f"theta{i} {wave}" for wave in WAVES}
+            of_joint = ("gear{}", "compliance{}", *(f"theta{{}} {w}" for w in WAVES))
+            joints = [n.format(i) for i in range(1, shared + 1) for n in of_joint]
+            of_all = {*links, *joints, *(BASE if shared else ())}
             of_arm = [n if n in of_all else f"{tip}: {n}" for n in arm.names]
             for i, number in enumerate(self.stands[k]):
                 (first, at), *others = self._members[number]
@@ -182,11 +181,12 @@ class Chains(Model):
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """p: of chain after chain, harmonics of all last."""
-        ends = [arm._at["harmonics"].start for arm in self.chains]
-        both = [*zip(self._named, ends, strict=True)]
-        first = [name for named, end in both for name in named[:end]]
-        waves = [name for named, end in both for name in named[end:]]
-        return tuple(dict.fromkeys([*first, *waves]))
+        first: list[str] = []
+        waves: list[str] = []
+        for arm, named in zip(self.chains, self._named, strict=True):
+            end = arm._at["harmonics"].start
+            first, waves = first + named[:end], waves + named[end:]
+        return tuple(dict.fromkeys(first + waves))
 
     @functools.cached_property
     def members(self) -> tuple[NDArray[np.intp], ...]:
@@ -304,11 +304,9 @@ class Chains(Model):
                 what it measured, or None for zeros (contacts) and candidates.
         """
         named = []
-        for tip, (given, read) in tables.items():
+        for tip, pair in tables.items():
             k = self.tips.index(one_of("tip", tip, self.tips))
-            named.append(
-                OneTable(tip, k, self._columns[k], self._scale(k), given, read)
-            )
+            named.append(OneTable(tip, k, self._columns[k], self._scale(k), *pair))
         place, q = len(self.joint_names), self.num_outputs
         return stacked(named, place, self.num_inputs, q)
 
@@ -453,7 +451,6 @@ class Chains(Model):
 
     @property
     def misfit_std(self) -> float:
-        """Largest of the chains' misfits of a reading, in noise."""
         arms = enumerate(self.chains)
         return max(arm.misfit_std / float(self._scale(k).min()) for k, arm in arms)
 
@@ -462,7 +459,6 @@ class Chains(Model):
         return all(arm.fits_misfit for arm in self.chains)
 
     def with_misfit(self) -> Self:
-        """These chains with harmonics of their joints."""
         return self._bent
 
     @functools.cached_property

@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arms.chain import SerialChain as Chain
+from jaxcal.arms.chains import Chains
 from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
 from jaxcal.arms.findings import (
+    CLEAR_UP,
     LOOK,
     Part,
     findings_of,
+    other_distances,
     parts_of,
     unit_after,
 )
@@ -33,7 +36,7 @@ from jaxcal.calibration.verdict import (
     never_measured,
     wrong_noise,
 )
-from jaxcal.checks import Array
+from jaxcal.checks import Array, one_of
 from jaxcal.information.singular import depends, significant
 
 if TYPE_CHECKING:
@@ -171,11 +174,13 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
     parts = parts_of(fit, used)
     held_out, off = left_out(fit), _nominal(fit, used, parts)
     errors = [one for part in parts for one in _in_units(fit, part, held_out, off)]
-    ratio, half = _ratio(held_out[used] / usual, off[used] / usual)
+    mean, half = _mean(np.linalg.norm(held_out[used] / usual, axis=1))
+    as_described = float(np.linalg.norm(off[used] / usual, axis=1).mean()) or 1e-300
+    ratio, half = mean / as_described, half / as_described
     # Below the nominal arm's; None where not sure.
     helps = ratio < 1.0 or (None if ratio - half < 1.0 else False)
-    scatter = _scattered(fit, usual, parts)
-    explains = scatter is None
+    scattered = _scattered(fit, usual, parts)
+    explains = scattered is None
     mistaken = ""
     if not explains and errors[0].nominal > _PLAIN * model.length:
         mistaken = mistaken_columns(model, commands, measured)
@@ -186,7 +191,7 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
         accuracy = {errors[0].unit: accuracy}
     more = accuracy is not None or helps is None
     reasons, clean, step = findings_of(
-        fit, used, parts, scatter, mistaken, anywhere, nominal, more
+        fit, used, parts, scattered, mistaken, anywhere, nominal, more
     )
     place = None
     if all(part.sensor.views for part in parts):
@@ -207,7 +212,9 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
     elif place is not None and place.std[0] < _PLACED * reach and explains:
         good = clean and ratio < _NO_WORSE
     else:
-        little = ratio + half < _LITTLE and not _wild(fit)
+        # No machine scatters that much: other units, columns.
+        wild = not fit.noise_known and scatter(fit) > _WILD
+        little = ratio + half < _LITTLE and not wild
         good = bool(clean and helps and (explains or little))
     return ArmVerdict(
         good=good,
@@ -275,14 +282,6 @@ def _sessions(fit: Fit, first: HeldOut) -> str:
     return f"Sessions differ by {size} (1 sigma); predictions include this."
 
 
-def _ratio(held_out: Array, off: Array) -> tuple[float, float]:
-    """Mean of held-out errors (K, q) by the nominal arm's, and half of its 95 %
-    interval."""
-    mean, half_width = _mean(np.linalg.norm(held_out, axis=1))
-    nominal = float(np.linalg.norm(off, axis=1).mean()) or 1e-300
-    return mean / nominal, half_width / nominal
-
-
 def _mean(errors: Array) -> tuple[float, float]:
     """Mean of errors (K,), and half of its 95 % interval."""
     half_width = 1.96 * errors.std() / np.sqrt(max(len(errors) - 1, 1))
@@ -313,11 +312,6 @@ def _in_units(fit: Fit, part: Part, held_out: Array, off: Array) -> Iterator[Hel
         interval = (max(mean - half, 0.0), mean + half)
         nominal = float(of_nominal.mean())
         yield HeldOut(part.title, quantity.unit, mean, interval, nominal)
-
-
-def _wild(fit: Fit) -> bool:
-    """Whether readings scatter so much that no machine does: other units, columns."""
-    return not fit.noise_known and scatter(fit) > _WILD
 
 
 def _scattered(fit: Fit, usual: Array, parts: list[Part]) -> Reason | None:
@@ -374,3 +368,97 @@ def _anywhere(fit: Fit, model: Chain, parts: list[Part]) -> tuple[Part, float]:
     basis = basis[:, significant(size)]
     moves = moves - basis @ (basis.T @ moves)
     return part, float(np.sqrt(((moves @ covariance) * moves).sum() / _DRAWN))
+
+
+def of_chain(model: Chains, fit: Any, tip: str) -> dict[str, Any]:
+    """The fields of a calibration that are of one chain, in its own units."""
+    k = model.tips.index(one_of("tip", tip, model.tips))
+    arm, at, scale = model.chains[k], fit.whole.members[k], model._scale(k)
+    q, rows = arm.num_outputs, fit.commands[:, len(model.joint_names)] == k
+    residuals = fit.residuals[rows, :q] * scale
+    noise = None if fit.noise_std is None else fit.noise_std[:q] * scale
+    square = fit.square
+    if noise is not None:
+        weights = fit.loss_weights[rows]
+        square = float((weights[:, None] * (residuals / noise) ** 2).sum())
+    share = int(rows.sum()) * q / max(len(fit.commands) * model.num_outputs, 1)
+    null = fit.unidentified
+    if null is not None:
+        null = null[:, at]
+        null = null[np.abs(null).max(axis=1, initial=0.0) > 0.0]
+    joint = fit.joint_covariance
+    by_parameter = ("estimate", "prior_mean", "prior_precision", "free")
+    by_row = ("loss_weights", "distance")
+    return {
+        **{name: getattr(fit, name)[at] for name in by_parameter},
+        **{name: getattr(fit, name)[rows] for name in by_row},
+        "model": arm,
+        "input_names": (*arm.joint_names, *arm.sensor.inputs),
+        "output_names": tuple(arm.sensor.outputs),
+        "joint_covariance": None if joint is None else joint[np.ix_(at, at)],
+        "unidentified": null if null is not None and len(null) else None,
+        "commands": fit.commands[rows][:, model._columns[k]],
+        "estimated_commands": None,
+        "residuals": residuals,
+        "dof": max(fit.dof * share, 0.0),
+        "square": square,
+        "num_readings": float(q),
+        "noise_std": noise,
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class ChainsVerdict(models.Verdict):
+    """What the readings say of each chain."""
+
+    of_chains: Mapping[str, ArmVerdict] = dataclasses.field(default_factory=dict)
+
+    @property
+    def held_out(self) -> float:
+        """Mean held-out error of the chains, each in its unit."""
+        return float(np.mean([of_arm.held_out for of_arm in self.of_chains.values()]))
+
+
+def verdict_of_chains(model: Chains, fit: Any) -> ChainsVerdict:
+    """Good where every chain that was read is, and distances that they share."""
+    used = np.flatnonzero(fit.loss_weights > 0.0)
+    tables = [
+        (k, commands, None) for k, _, _, commands in model._parts(fit.commands[used])
+    ]
+    tips = [model.tips[k] for k, *_ in tables]
+    of_chains = {tip: fit.of(tip).verdict for tip in tips}
+    bad = [tip for tip in tips if not of_chains[tip].good]
+    step = f"{bad[0]}: {of_chains[bad[0]].next_step}" if bad else models.USE
+    reasons = [f"{tip}: {line}" for tip in tips for line in of_chains[tip].lines()]
+    reasons += [f"{tip}: no reading" for tip in model.tips if tip not in tips]
+    wrong = False
+    if fit.noise_std is None:
+        step = "measure more postures, or state noise_std=1 (in units of noise)"
+    else:
+        length = min(arm.length for arm in model.chains)
+        parts = _shared_parts(model, used, tables)
+        apart, wrong = other_distances(fit, parts, length)
+        reasons += apart
+        step = CLEAR_UP if wrong else step
+    good = not (bad or wrong)
+    return ChainsVerdict(good, tuple(reasons), step, "", of_chains)
+
+
+def _shared_parts(
+    model: Chains, used: NDArray[np.intp], tables: list[tuple[int, Array, None]]
+) -> list[Part]:
+    """What chains read of the sensors that they share, of the rows ``used``; distances
+    that one chain's contacts judge are left to its own verdict."""
+    parts = []
+    for number, readings in model._by_member(model.chains, tables).items():
+        if len(readings) < 2:
+            continue
+        k, i = model._members[number][0]
+        sensor, own = readings[0].sensor, model.members[k][model.chains[k].own(i)]
+        columns = np.vstack([of_chain.columns for of_chain in readings])
+        points = np.vstack([of_chain.tip.position for of_chain in readings])
+        where = (used, columns, points, own, readings[0].scale)
+        part = Part(number, sensor, sensor.kind, "", *where)
+        alone = [part._replace(columns=r.columns).touched() for r in readings]
+        parts.append(part._replace(judged=np.any(alone, axis=0)))
+    return parts

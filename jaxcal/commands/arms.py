@@ -82,7 +82,13 @@ class ArmOptions:
         kinds = [name for name in SENSORS if name != "several"]
         return one_of("--sensor", self.sensor or "position", kinds)
 
-    def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:
+    def read(
+        self,
+        path: str,
+        table: Table | None,
+        places: Any = None,
+        count: int | None = None,
+    ) -> SerialChain:
         """The arm in this file; things that it touches are given or in the table."""
         from jaxcal.arms import SerialChain
 
@@ -92,7 +98,7 @@ class ArmOptions:
                 f"--tip takes one link, got {tips}. Several chains in one model need "
                 "Python: Chains in docs/arms.md"
             )
-        sensor = self._sensor(table, places)
+        sensor = self._sensor(table, places, count)
         for option, count in (("locked", 1), ("limits", 2)):
             for name, values in getattr(self, option) or ():
                 if not name or len(values) != count:
@@ -107,41 +113,41 @@ class ArmOptions:
             limits=dict(self.limits or ()),
         )
 
-    def _sensor(self, table: Table | None, places: Any) -> Sensor:
+    def _sensor(self, table: Table | None, places: Any, count: int | None) -> Sensor:
         """The sensor, with as many landmarks as are given or in the table."""
         from jaxcal.arms.sensors import SENSORS, Board, Landmarks, Several, Socket
 
-        kind = SENSORS[self.kind]
-        landmarks: dict[str, Any] = {}
-        if issubclass(kind, Landmarks):
-            if places is not None:
-                if {len(place) for place in places} != {kind.width}:
-                    raise ValueError(
-                        f"--near takes {kind.width} numbers for --sensor {self.kind}, "
-                        f"got {places}"
-                    )
-                landmarks |= {"count": len(places), "places": places}
-            elif table is not None and self.kind in table.names:
-                column = table.columns([self.kind])
-                landmarks["count"] = 1 + int(column.max(initial=0.0))
-        if self.on_tip is not None:
-            if kind is not Board:
-                raise ValueError("--on-tip needs --sensor board")
-            landmarks["moves"] = self.on_tip
-        if self.distance:
-            if kind is not Socket:
-                raise ValueError("--distance needs --sensor socket")
-            landmarks["distances"] = self.distance
-            if table is not None and self.kind not in table.names:
-                raise ValueError(
-                    f"{table.source}: --distance needs a column 'socket', from 0"
-                )
-        if kind is Board and table is not None and "sensor" in table.names:
+        kind, names = SENSORS[self.kind], () if table is None else table.names
+        if self.on_tip is not None and kind is not Board:
+            raise ValueError("--on-tip needs --sensor board")
+        if self.distance and kind is not Socket:
+            raise ValueError("--distance needs --sensor socket")
+        if self.distance and table is not None and self.kind not in names:
+            raise ValueError(
+                f"{table.source}: --distance needs a column 'socket', from 0"
+            )
+        if kind is Board and table is not None and "sensor" in names:
             # Cameras that stand around one board on the tip, from 0.
-            count = 1 + int(table.columns(["sensor"]).max(initial=0.0))
-            boards = [Board("board", same_board=i > 0) for i in range(count)]
-            return Several(tuple(boards)) if count > 1 else boards[0]
-        return kind(**landmarks)
+            cameras = range(1 + int(table.columns(["sensor"]).max(initial=0.0)))
+            boards = [Board("board", same_board=i > 0) for i in cameras]
+            return Several(tuple(boards)) if len(boards) > 1 else boards[0]
+        fields: dict[str, Any] = {}
+        if self.on_tip is not None:
+            fields["moves"] = self.on_tip
+        if self.distance:
+            fields["distances"] = self.distance
+        if issubclass(kind, Landmarks) and places is not None:
+            if {len(place) for place in places} != {kind.width}:
+                raise ValueError(
+                    f"--near takes {kind.width} numbers for --sensor {self.kind}, got "
+                    f"{places}"
+                )
+            fields |= {"count": len(places), "places": places}
+        elif issubclass(kind, Landmarks) and count is not None:
+            fields["count"] = count
+        elif issubclass(kind, Landmarks) and table is not None and self.kind in names:
+            fields["count"] = 1 + int(table.columns([self.kind]).max(initial=0.0))
+        return kind(**fields)
 
     def of_recording(self, path: str | None, which: Sequence[int] | None) -> Any:
         """The arm of a recording whose rests are of ``which`` sockets."""
@@ -149,11 +155,8 @@ class ArmOptions:
             return None
         if self.radians:
             raise ValueError("--radians goes with tables; recordings state their unit")
-        if which is None:
-            return self.read(str(path), None)
-        column = np.array(which, dtype=np.float64)[:, None]
-        lines = tuple(range(1, 1 + len(column)))
-        return self.read(str(path), Table("", (self.kind,), column, {}, lines))
+        count = None if which is None else 1 + max(which, default=0)
+        return self.read(str(path), None, count=count)
 
     def machine(self, path: str | None, table: Table | None) -> Model | None:
         """The model in a file, an arm or another; None without one.

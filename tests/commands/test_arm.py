@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from unittest import mock
@@ -219,7 +220,9 @@ def test_a_camera_bounds_what_is_planned(files, capsys):
     measured = ["--measured", str(files[2] / "views.csv"), "-k", "7"]
     rows, _ = _planned(files, board, *flags, *measured)
     options = {"camera": (640, 480, 600, 600, 320, 240), "distance": (0.35, 0.7)}
-    offered = arm.postures(12, tilt=30.0, **options)
+    found = arm.measured_with(Board("camera")).located(np.hstack([views, seen]))
+    side = dataclasses.replace(board, side=found.sensor.side)
+    offered = arm.measured_with(side).postures(12, tilt=30.0, **options)
     rows, offered = rows[:, :7], offered[:, :7]
     off = np.abs(rows[:, None] - offered).max(axis=-1).min(axis=1)
     assert off.max() < 0.1 < np.abs(rows[:, None] - arm.postures(12)[:, :7]).max()
