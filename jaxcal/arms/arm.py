@@ -156,8 +156,12 @@ class Arm:
 
     def readings(self, commands: Array, measured: Array | None) -> Iterator[Readings]:
         """What each of its sensors reads, from where the nominal arm has it."""
-        inputs = commands[:, self.num_joints :]
-        return self.sensor.of_members(self.nominal_tip(commands), inputs, measured)
+        inputs, tip = commands[:, self.num_joints :], self.nominal_tip(commands)
+        kinds = [sensor.kind for sensor in self.sensor.members]
+        for i, part in enumerate(self.sensor.of_members(tip, inputs, measured)):
+            kind = part.sensor.kind
+            kind = f"sensor {i}'s {kind}" if kinds.count(kind) > 1 else kind
+            yield part._replace(member=i, kind=kind, own=self.own(i))
 
     def skeleton(self, commands: ArrayLike) -> Array:
         """(N, n + 2, 3) the base, each joint's origin and the tip, to be drawn."""

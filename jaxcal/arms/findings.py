@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.arms.chain import SerialChain as Chain
-from jaxcal.arms.sensors import Sensor, Socket, Wrench
+from jaxcal.arms.sensors import Socket, Wrench
+from jaxcal.arms.sensors.sensor import Readings
 from jaxcal.calibration.verdict import Reason, in_rows, outlying
 from jaxcal.checks import Array
 
@@ -41,43 +42,13 @@ _ZERO = 10.0  # degrees: no zero of a joint is set so badly
 _SHOWN = 0.5  # of the prior's variance: less was removed, readings hardly show it
 
 
-class Part(NamedTuple):
-    """What one sensor of an arm, or of arms that share it, read."""
-
-    member: int  # number of it
-    sensor: Sensor
-    kind: str  # of it, for a message
-    title: str  # that, "" where there are no others
-    rows: NDArray[np.intp]  # (K,) measurements that are used
-    columns: Array  # (K, e) of their commands
-    points: Array  # (K, 3) where the arm as described has it
-    own: slice | NDArray[np.intp]  # of the parameters
-    scale: Array  # (q,) its unit in that of the calibration's readings
-    judged: NDArray[np.bool_] | None = None  # (D,) distances, of one of the arms alone
-
-    def groups(self) -> list[NDArray[np.intp]]:
-        """Rows of each socket, plane or anchor, in the order of measuring."""
-        which = self.sensor.of_rows(self.columns)
-        return [self.rows[which == i] for i in range(self.sensor.num_places)]
-
-    def touched(self) -> NDArray[np.bool_]:
-        """(D,) distances both of whose sockets have contacts of this arm."""
-        pairs = np.array(getattr(self.sensor, "distances", ())).reshape(-1, 4)[:, :2]
-        labels = self.sensor.of_rows(self.columns)
-        return np.asarray(np.isin(pairs, labels).all(axis=1))
-
-
-def parts_of(fit: Fit, used: NDArray[np.intp]) -> list[Part]:
-    """Readings of each sensor that has some."""
-    model, commands = fit.model, fit.commands[used]
-    kinds, parts = [one.kind for one in model.sensor.members], []
-    for i, read in enumerate(model.readings(commands, None)):
-        twice = kinds.count(read.sensor.kind) > 1
-        kind = f"sensor {i}'s {read.sensor.kind}" if twice else read.sensor.kind
-        if len(read.rows):
-            rows, points, own = used[read.rows], read.tip.position, model.own(i)
-            what, where = (i, read.sensor, kind, kind), (rows, read.columns, points)
-            parts.append(Part(*what, *where, own, read.scale))
+def parts_of(fit: Fit, used: NDArray[np.intp]) -> list[Readings]:
+    """Readings of each sensor that has some, of the rows ``used`` (K,)."""
+    parts = [
+        part._replace(rows=used[part.rows], title=part.kind)
+        for part in fit.model.readings(fit.commands[used], None)
+        if len(part.rows)
+    ]
     return [parts[0]._replace(title="")] if len(parts) == 1 else parts
 
 
@@ -90,7 +61,7 @@ def unit_after(fit: Fit) -> str:
 def findings_of(
     fit: Fit,
     used: NDArray[np.intp],
-    parts: list[Part],
+    parts: list[Readings],
     scatter: Reason | None,
     mistaken: str,
     anywhere: float,
@@ -167,7 +138,7 @@ def findings_of(
 
 
 def left_open(
-    parts: list[Part], unit: str, anywhere: float, nominal: float
+    parts: list[Readings], unit: str, anywhere: float, nominal: float
 ) -> Reason | None:
     """The readings leave the arm open, where they do: of contacts the size, since a
     smaller arm touches nearer sockets as well."""
@@ -191,7 +162,7 @@ def left_open(
 def _wrong_rows(
     fit: Fit,
     used: NDArray[np.intp],
-    parts: list[Part],
+    parts: list[Readings],
     swapped: dict[int, int],
     outliers: list[int],
 ) -> list[str]:
@@ -265,7 +236,7 @@ def _other_tip(fit: Fit, model: Chain) -> tuple[list[str], bool]:
 
 
 def other_distances(
-    fit: Fit, parts: list[Part], length: float
+    fit: Fit, parts: list[Readings], length: float
 ) -> tuple[list[str], bool]:
     """Distances that were given and that the contacts contradict; by much or not.
 
@@ -302,7 +273,7 @@ def other_distances(
     return said, most > _WRONG * length
 
 
-def _facts(fit: Fit, part: Part) -> tuple[Array, Array]:
+def _facts(fit: Fit, part: Readings) -> tuple[Array, Array]:
     """What is known of a sensor's things: (F,) off, (F, p) derivative."""
     off, own = part.sensor.facts(fit.parameters[part.own])
     rows = np.zeros((len(off), len(fit.names)))
@@ -310,7 +281,7 @@ def _facts(fit: Fit, part: Part) -> tuple[Array, Array]:
     return off, rows
 
 
-def _freed(fit: Fit, part: Part, row: int) -> tuple[float, float]:
+def _freed(fit: Fit, part: Readings, row: int) -> tuple[float, float]:
     """A given distance as the readings have it without it, and its deviation."""
     model, touched = fit.model, part.touched()
     touched[row] = False
@@ -362,7 +333,7 @@ def _still(model: Chain, commands: Array) -> tuple[list[str], bool]:
     return said, bool((joints[0, still] == 0.0).any())
 
 
-def _other_links(fit: Fit, parts: list[Part]) -> list[str]:
+def _other_links(fit: Fit, parts: list[Readings]) -> list[str]:
     """Lengths and zeros far from the arm's description, if a prior allowed that."""
     model = fit.model
     names, units = np.array(model.names), np.array(model.units)
@@ -388,7 +359,7 @@ def _other_links(fit: Fit, parts: list[Part]) -> list[str]:
     ]
 
 
-def _exchanged(fit: Fit, part: Part) -> list[str]:
+def _exchanged(fit: Fit, part: Readings) -> list[str]:
     """Sockets that were found where others were said to be."""
     sensor = part.sensor
     if not isinstance(sensor, Socket) or sensor.places is None:
@@ -406,7 +377,7 @@ def _exchanged(fit: Fit, part: Part) -> list[str]:
     ]
 
 
-def _moved(fit: Fit, part: Part, swapped: dict[int, int]) -> list[str]:
+def _moved(fit: Fit, part: Readings, swapped: dict[int, int]) -> list[str]:
     """Sockets and planes whose first and last contacts lie apart."""
     reasons, unit, rng = [], unit_after(fit), np.random.default_rng(0)
     width = len(part.scale)
@@ -443,7 +414,7 @@ def _split(values: Array) -> tuple[float, int, float, float]:
     return float(gain[best]), int(at[best]), float(apart[best]), float(within)
 
 
-def _swapped(fit: Fit, part: Part, explains: bool) -> dict[int, int]:
+def _swapped(fit: Fit, part: Readings, explains: bool) -> dict[int, int]:
     """Outliers that fit another socket or plane, as if their column were wrong."""
     model, sensor = fit.model, part.sensor
     if not (sensor.zeros and sensor.num_places > 1):
@@ -461,7 +432,7 @@ def _swapped(fit: Fit, part: Part, explains: bool) -> dict[int, int]:
             swaps[int(at[row])] = int(other)
     if isinstance(sensor, Socket) and not explains:
         # So many that none is an outlier: by the arm as described, where that can tell.
-        points = part.points
+        points = part.tip.position
         labels, which = np.unique(sensor.of_rows(part.columns), return_inverse=True)
         middles = [np.median(points[which == i], axis=0) for i in range(len(labels))]
         apart = np.linalg.norm(points[:, None] - middles, axis=-1)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.arguments import pose_matrix
-from jaxcal.arms.files.urdf import joints_of, links_of, table_of, walk
+from jaxcal.arms.files.urdf import described, links_of
 from jaxcal.arms.files.write import fixed_joint, with_origins
 from jaxcal.arms.sensors import Board
 from jaxcal.arms.verdict import place_of
@@ -91,7 +91,8 @@ def static_transform(
     theta, source = again.parameters, model.source
     if sensor.moves == "camera":
         names = tool
-        matrix = np.linalg.inv(_tip(source)) @ model.calibrated(theta).tool
+        tip = described(source)["tool"] if source else np.eye(4)  # in the last joint
+        matrix = np.linalg.inv(tip) @ model.calibrated(theta).tool
     else:
         names = list(owns[camera][:6])
         at = [model.names.index(name) for name in names]
@@ -114,15 +115,6 @@ def static_transform(
         f"left-out views are off by {off}",
         source,
     )
-
-
-def _tip(source: Any) -> Array:
-    """(4, 4) of the tip link in the last joint's frame, as described."""
-    if source is None:
-        return np.eye(4)
-    joints, locked = joints_of(source["text"]), source["locked"]
-    chain = list(walk(source["text"], source["base"], source["tip"], locked))
-    return np.asarray(table_of(chain, joints, locked, {})["tool"])
 
 
 def to_transform(

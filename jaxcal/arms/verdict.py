@@ -19,7 +19,6 @@ from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
 from jaxcal.arms.findings import (
     CLEAR_UP,
     LOOK,
-    Part,
     findings_of,
     other_distances,
     parts_of,
@@ -27,7 +26,7 @@ from jaxcal.arms.findings import (
 )
 from jaxcal.arms.plausible import mistaken_columns
 from jaxcal.arms.sensors import Pose, Socket
-from jaxcal.arms.sensors.sensor import hats
+from jaxcal.arms.sensors.sensor import Readings, hats
 from jaxcal.calibration import verdict as models
 from jaxcal.calibration.verdict import (
     Reason,
@@ -196,7 +195,7 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
     place = None
     if all(part.sensor.views for part in parts):
         place = place_of(fit, [f"tool {axis}" for axis in Pose.tool])
-    reach = model.length or float(np.ptp(parts[0].points, axis=0).max())
+    reach = model.length or float(np.ptp(parts[0].tip.position, axis=0).max())
     if place is not None and place.hidden:
         reasons += (
             f"{', '.join(place.hidden)}: not shown by these views, kept at the nominal "
@@ -288,7 +287,7 @@ def _mean(errors: Array) -> tuple[float, float]:
     return float(errors.mean()), float(half_width)
 
 
-def _nominal(fit: Fit, used: NDArray[np.intp], parts: list[Part]) -> Array:
+def _nominal(fit: Fit, used: NDArray[np.intp], parts: list[Readings]) -> Array:
     """(N, q) errors of the nominal arm, of the rows ``used``."""
     commands, measured = fit.commands[used], fit.measured[used]
     model, off = fit.model, np.zeros_like(fit.residuals)
@@ -300,7 +299,9 @@ def _nominal(fit: Fit, used: NDArray[np.intp], parts: list[Part]) -> Array:
     return off
 
 
-def _in_units(fit: Fit, part: Part, held_out: Array, off: Array) -> Iterator[HeldOut]:
+def _in_units(
+    fit: Fit, part: Readings, held_out: Array, off: Array
+) -> Iterator[HeldOut]:
     """A part's mean errors, those of each unit by themselves."""
     unit = fit.measured_unit
     for quantity in fit.model.quantities_of(part.sensor, unit):
@@ -314,7 +315,7 @@ def _in_units(fit: Fit, part: Part, held_out: Array, off: Array) -> Iterator[Hel
         yield HeldOut(part.title, quantity.unit, mean, interval, nominal)
 
 
-def _scattered(fit: Fit, usual: Array, parts: list[Part]) -> Reason | None:
+def _scattered(fit: Fit, usual: Array, parts: list[Readings]) -> Reason | None:
     """Readings that scatter by more than the noise explains."""
     if fit.noise_known:
         return wrong_noise(fit)
@@ -333,7 +334,7 @@ def _scattered(fit: Fit, usual: Array, parts: list[Part]) -> Reason | None:
     )
 
 
-def _anywhere(fit: Fit, model: Chain, parts: list[Part]) -> tuple[Part, float]:
+def _anywhere(fit: Fit, model: Chain, parts: list[Readings]) -> tuple[Readings, float]:
     """The first part whose readings are positions, and the standard deviation of the
     tip's position at postures of any kind, beside a shift and a turn of the whole arm.
 
@@ -446,7 +447,7 @@ def verdict_of_chains(model: Chains, fit: Any) -> ChainsVerdict:
 
 def _shared_parts(
     model: Chains, used: NDArray[np.intp], tables: list[tuple[int, Array, None]]
-) -> list[Part]:
+) -> list[Readings]:
     """What chains read of the sensors that they share, of the rows ``used``; distances
     that one chain's contacts judge are left to its own verdict."""
     parts = []
@@ -454,11 +455,13 @@ def _shared_parts(
         if len(readings) < 2:
             continue
         k, i = model._members[number][0]
-        sensor, own = readings[0].sensor, model.members[k][model.chains[k].own(i)]
-        columns = np.vstack([of_chain.columns for of_chain in readings])
-        points = np.vstack([of_chain.tip.position for of_chain in readings])
-        where = (used, columns, points, own, readings[0].scale)
-        part = Part(number, sensor, sensor.kind, "", *where)
+        part = readings[0]._replace(
+            member=number,
+            kind=readings[0].sensor.kind,
+            own=model.members[k][model.chains[k].own(i)],
+            rows=used,
+            columns=np.vstack([of_chain.columns for of_chain in readings]),
+        )
         alone = [part._replace(columns=r.columns).touched() for r in readings]
         parts.append(part._replace(judged=np.any(alone, axis=0)))
     return parts

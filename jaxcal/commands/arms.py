@@ -82,13 +82,7 @@ class ArmOptions:
         kinds = [name for name in SENSORS if name != "several"]
         return one_of("--sensor", self.sensor or "position", kinds)
 
-    def read(
-        self,
-        path: str,
-        table: Table | None,
-        places: Any = None,
-        count: int | None = None,
-    ) -> SerialChain:
+    def read(self, path: str, table: Table | None, places: Any = None) -> SerialChain:
         """The arm in this file; things that it touches are given or in the table."""
         from jaxcal.arms import SerialChain
 
@@ -98,7 +92,7 @@ class ArmOptions:
                 f"--tip takes one link, got {tips}. Several chains in one model need "
                 "Python: Chains in docs/arms.md"
             )
-        sensor = self._sensor(table, places, count)
+        sensor = self._sensor(table, places)
         for option, count in (("locked", 1), ("limits", 2)):
             for name, values in getattr(self, option) or ():
                 if not name or len(values) != count:
@@ -113,7 +107,7 @@ class ArmOptions:
             limits=dict(self.limits or ()),
         )
 
-    def _sensor(self, table: Table | None, places: Any, count: int | None) -> Sensor:
+    def _sensor(self, table: Table | None, places: Any) -> Sensor:
         """The sensor, with as many landmarks as are given or in the table."""
         from jaxcal.arms.sensors import SENSORS, Board, Landmarks, Several, Socket
 
@@ -143,8 +137,6 @@ class ArmOptions:
                     f"{places}"
                 )
             fields |= {"count": len(places), "places": places}
-        elif issubclass(kind, Landmarks) and count is not None:
-            fields["count"] = count
         elif issubclass(kind, Landmarks) and table is not None and self.kind in names:
             fields["count"] = 1 + int(table.columns([self.kind]).max(initial=0.0))
         return kind(**fields)
@@ -155,8 +147,11 @@ class ArmOptions:
             return None
         if self.radians:
             raise ValueError("--radians goes with tables; recordings state their unit")
-        count = None if which is None else 1 + max(which, default=0)
-        return self.read(str(path), None, count=count)
+        if which is None:
+            return self.read(str(path), None)
+        column = np.array(which, dtype=np.float64)[:, None]
+        lines = tuple(range(1, 1 + len(column)))
+        return self.read(str(path), Table("", (self.kind,), column, {}, lines))
 
     def machine(self, path: str | None, table: Table | None) -> Model | None:
         """The model in a file, an arm or another; None without one.

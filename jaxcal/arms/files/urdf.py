@@ -276,6 +276,13 @@ def _unit(joint: Joint) -> float:
     return float(np.radians(1.0)) if joint.kind == "R" else 1.0
 
 
+def described(source: Mapping[str, Any]) -> dict[str, Any]:
+    """``table_of`` an arm's file, of its base and tip as they are there."""
+    text, locked = source["text"], source["locked"]
+    chain = list(walk(text, source["base"], source["tip"], locked))
+    return table_of(chain, joints_of(text), locked, dict(source))
+
+
 def table_of(
     chain: list[tuple[Joint, bool]],
     joints: dict[str, Joint],

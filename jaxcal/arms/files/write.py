@@ -24,12 +24,12 @@ from jaxcal.arms.arm import Arm
 from jaxcal.arms.files.urdf import (
     UR,
     Joint,
+    described,
     joints_of,
     led,
     links_of,
     moved,
     row_matrix,
-    table_of,
     turn_of_z,
     walk,
 )
@@ -77,9 +77,6 @@ def write(
 ) -> str:
     """Write the arm with ``parameters`` as a file that robots read.
 
-    Such files cannot hold compliance and gear harmonics: these are left out, with a
-    warning.
-
     Args:
         form: "urdf" is the file that the arm came from, its origins corrected: all else
             stays as it is, and the tip goes where ``predict`` of positions puts it, the
@@ -88,33 +85,26 @@ def write(
             convention; a warning names joints that follow others. "ur" is the YAML file
             of Universal Robots' ROS description, for six joints, without base and tool.
         parameters: (p,) as ``identify`` found them.
-        force: overwrite an existing file.
 
     Returns:
         Of "urdf" the tip link, a new one where no fixed joint before it could hold the
             tool; else "".
 
     Raises:
-        ValueError: the arm is not of the form, as with joints that follow others for
-            "ur"; a gear ratio was found, which none can hold.
+        ValueError: the arm is not of the form; a gear ratio, compliance or harmonics
+            were found, which none can hold.
         FileExistsError: there is a file and ``force`` is not given.
     """
-    ratios, yields, waves = arm._drives(as_parameters(arm, parameters))
-    for i in np.flatnonzero(ratios != 1.0):
-        raise ValueError(
-            f"gear{i + 1} is {ratios[i]:.6g}, which this file format cannot hold"
-        )
-    lost = [f"compliance{arm.compliance[i]}" for i in np.flatnonzero(yields)]
+    theta = as_parameters(arm, parameters)
+    ratios, yields, waves = arm._drives(theta)
+    lost = [f"gear{i + 1} is {ratios[i]:.6g}" for i in np.flatnonzero(ratios != 1.0)]
+    lost += [f"compliance{arm.compliance[i]}" for i in np.flatnonzero(yields)]
     bent = np.flatnonzero(waves.any(axis=1))
     lost += [f"harmonics of joint {arm.harmonics[i]}" for i in bent]
     if lost:
-        what = ", ".join(lost)
-        warnings.warn(
-            f"{what} left out: the file cannot hold compliance and gear harmonics",
-            stacklevel=2,
-        )
+        raise ValueError(f"{', '.join(lost)}, which this file format cannot hold")
     one_of("form", form, ("urdf", "dh", "ur"))
-    calibrated, tip = arm.calibrated(parameters), ""
+    calibrated, tip = arm.calibrated(theta), ""
     if form == "urdf":
         text, (tip,) = urdf_text([(arm, calibrated)])
     else:
@@ -281,12 +271,9 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
 
 def _steps(nominal: Arm, calibrated: Arm) -> tuple[list[list[_Part]], list[Array]]:
     """The gaps of the file, and what each of them is as calibrated, (4, 4)."""
-    assert nominal.source is not None  # the caller has looked
-    text, locked = nominal.source["text"], nominal.source["locked"]
-    joints, ends = joints_of(text), (nominal.source["base"], nominal.source["tip"])
-    gaps = _gaps(nominal.source)
+    gaps = _gaps(nominal.source or {})
     # The nominal base may be where a tracker sees it, and not the file's.
-    base = table_of(list(walk(text, *ends, locked)), joints, locked, {})["base"]
+    base = described(nominal.source or {})["base"]
     rows = [row_matrix(row) for row in nominal.table]
     new = [row_matrix(row) for row in calibrated.table]
     turns = [np.linalg.inv(base) @ _product(gaps[0])]
@@ -300,7 +287,6 @@ def _steps(nominal: Arm, calibrated: Arm) -> tuple[list[list[_Part]], list[Array
 
 def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | None]:
     """New origins by joint, and what no joint before the tip can hold, if anything."""
-    assert nominal.source is not None  # the caller has looked
     origins: dict[str, Array] = {}
     extra = None
     for i, (gap, matrix) in enumerate(zip(*_steps(nominal, calibrated), strict=True)):
@@ -310,8 +296,9 @@ def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | N
             extra = matrix
             continue
         if not gap:
+            base = (nominal.source or {})["base"]
             raise ValueError(
-                f"base {nominal.source['base']!r} moves with its joint and cannot be "
+                f"base {base!r} moves with its joint and cannot be "
                 "corrected: choose or add a link fixed to it as base"
             )
         driving = [k for k, part in enumerate(gap) if part.drives]

@@ -61,6 +61,22 @@ class Readings(NamedTuple):
     measured: Array | None  # (N, q), None of candidates
     rows: NDArray[np.intp]  # (N,) of all that the arm measured
     scale: Array  # (q,) its unit in that of the arm's readings
+    member: int = 0  # its number among the arm's
+    kind: str = ""  # of it, for a message
+    title: str = ""  # that, "" where there are no others
+    own: Any = slice(0)  # of the arm's parameters
+    judged: Any = None  # (D,) distances, of one of several arms alone
+
+    def groups(self) -> list[NDArray[np.intp]]:
+        """Rows of each socket, plane or anchor, in the order of measuring."""
+        which = self.sensor.of_rows(self.columns)
+        return [self.rows[which == i] for i in range(self.sensor.num_places)]
+
+    def touched(self) -> NDArray[np.bool_]:
+        """(D,) distances both of whose sockets have contacts of this arm."""
+        pairs = np.array(getattr(self.sensor, "distances", ())).reshape(-1, 4)[:, :2]
+        labels = self.sensor.of_rows(self.columns)
+        return np.asarray(np.isin(pairs, labels).all(axis=1))
 
     def at(self, rows: NDArray[np.intp]) -> Readings:
         """Some of them."""
