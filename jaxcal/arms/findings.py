@@ -168,10 +168,9 @@ def _wrong_rows(
 ) -> list[str]:
     """Rows of another socket, outliers, and contacts that were written twice."""
     commands = fit.commands
-    kinds = {row: part.kind for part in parts for row in part.rows.tolist()}
-    touching = {row: p.sensor.zeros for p in parts for row in p.rows.tolist()}
+    of_row = {row: part for part in parts for row in part.rows.tolist()}
     said = [
-        f"measurement {row} fits {kinds[row]} {other} instead"
+        f"measurement {row} fits {of_row[row].kind} {other} instead"
         for row, other in sorted(swapped.items())
     ]
     loose = [row for row in outliers if row not in swapped]
@@ -179,7 +178,7 @@ def _wrong_rows(
         said.append(reason.fact)
     for doubled in np.flatnonzero(fit.loss_weights == 0.0):
         same = (commands[used] == commands[doubled]).all(axis=1)
-        if same.any() and touching[used[same][0]]:
+        if same.any() and of_row[used[same][0]].sensor.zeros:
             said.append(f"measurement {doubled} repeats {used[same][0]}, counted once")
     return said
 

@@ -57,7 +57,7 @@ def recorded(arm: Chain, recording: Recording) -> tuple[Array, Array | None]:
             readings.
         MissingExtraError: what reads it is not installed.
     """
-    sensor, which = arm.sensor, recording.which or ()
+    sensor = arm.sensor
     views = sensor.views and sensor.zeros
     if not views and tuple(sensor.inputs) not in ((), (sensor.kind,)):
         raise ValueError(
@@ -75,6 +75,7 @@ def recorded(arm: Chain, recording: Recording) -> tuple[Array, Array | None]:
         turns = Rotation.from_matrix(matrices).as_rotvec(degrees=True)
         commands = np.column_stack([commands, read[:, :3], turns])
     elif sensor.inputs:
+        which = () if recording.which is None else recording.which
         if len(which) != len(commands):
             raise ValueError(
                 f"which must give the {sensor.kind} of each of the {len(commands)} "
