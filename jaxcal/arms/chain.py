@@ -25,6 +25,7 @@ from jaxcal.arms.arguments import (
 from jaxcal.arms.arm import Arm, Load, apparent_length, numbered
 from jaxcal.arms.files.urdf import read_ur_kinematics, read_urdf
 from jaxcal.arms.sensors import Position, Sensor, Several
+from jaxcal.arms.sensors.sensor import plain_fields
 from jaxcal.arms.sensors.several import OneTable, stacked
 from jaxcal.checks import Array, array_of, axis_names, numbers, one_of
 from jaxcal.late import late
@@ -461,17 +462,11 @@ class SerialChain(Arm, Model):
 
     def to_dict(self) -> dict[str, Any]:
         """What a file holds of the model."""
-        fields = (field.name for field in dataclasses.fields(self))
-        values = {name: getattr(self, name) for name in fields}
-        data = {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in values.items()
-        }
         # JSON knows no infinity: null is a limit that is not known.
         ends = self.limits.astype(object)
         ends[np.isinf(self.limits)] = None
         rest = {"limits": ends.tolist(), "sensor": self.sensor.to_dict()}
-        return {"kind": "serial_chain", **data, **rest}
+        return {"kind": "serial_chain", **plain_fields(self), **rest}
 
 
 def turning(joints: str) -> list[int]:

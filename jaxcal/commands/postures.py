@@ -24,10 +24,10 @@ _DRAWS = 10  # random choices that a plan is compared with
 
 
 @dataclasses.dataclass
-class ViewOptions:
-    """A board, and how a camera sees it."""
+class PostureOptions:
+    """How a camera sees a board, and what the arm avoids."""
 
-    TITLE: ClassVar[str] = "of --sensor board"
+    TITLE: ClassVar[str] = "which postures: views of --sensor board, obstacles"
     RARE: ClassVar[bool] = True
 
     camera: Annotated[
@@ -50,6 +50,13 @@ class ViewOptions:
         float | None, "largest angle between board and camera in degrees, default 45"
     ] = None
 
+    floor: Annotated[float | None, "lowest allowed height of a joint"] = None
+    approach: Annotated[
+        list[float] | None,
+        "the tool's approach: direction and largest angle from it: 0,0,-1,60",
+        several(float, "numbers"),
+    ] = None
+
     def with_board(self, arm: SerialChain) -> SerialChain:
         """The arm whose board is of this width and height, if they are given."""
         if self.board is None:
@@ -62,27 +69,11 @@ class ViewOptions:
         )
 
 
-@dataclasses.dataclass
-class RoomOptions:
-    """What the arm avoids."""
-
-    TITLE: ClassVar[str] = "what the arm avoids"
-    RARE: ClassVar[bool] = True
-
-    floor: Annotated[float | None, "lowest allowed height of a joint"] = None
-    approach: Annotated[
-        list[float] | None,
-        "the tool's approach: direction and largest angle from it: 0,0,-1,60",
-        several(float, "numbers"),
-    ] = None
-
-
 def postures(
     model: Annotated[str, "the arm's .urdf"],
     *,
     k: Annotated[int, "number of postures, measured ones included", "K"],
-    view: ViewOptions,
-    room: RoomOptions,
+    of_postures: PostureOptions,
     of_arm: ArmOptions,
     near: Annotated[
         list[list[float]] | None,
@@ -129,16 +120,16 @@ def postures(
     if more < 1:
         reason = f"-k must be above {k - more}, the number of postures already measured"
         raise ValueError(f"{reason}, got {k}")
-    arm = view.with_board(arm)
+    arm = of_postures.with_board(arm)
     offered = arm.postures(
         count,
         seed=seed,
         near=None if placed else near,
-        camera=view.camera,
-        distance=view.away,
-        tilt=view.tilt,
-        floor=room.floor,
-        approach=room.approach,
+        camera=of_postures.camera,
+        distance=of_postures.away,
+        tilt=of_postures.tilt,
+        floor=of_postures.floor,
+        approach=of_postures.approach,
     )
     design = Design(offered, model=arm, measured=done)
     chosen = design.select(more, method="exchange").indices

@@ -111,9 +111,8 @@ class Gravity(AtRest):
                 "give that as up=, or negate them if the sensor reads down"
             )
         felt = np.array(self.up) @ tip.rotation
-        left, spread, right = np.linalg.svd(felt.T @ directions)
-        left[:, 2] *= np.linalg.det(left @ right)
-        turn = Rotation.from_matrix(left @ right)
+        spread = np.linalg.svd(felt.T @ directions, compute_uv=False)
+        turn = Rotation.from_matrix(_turn(felt, directions)[0])
         off, other = (
             np.median(np.linalg.norm(felt - one, axis=1))
             for one in (directions, turn.apply(directions))

@@ -19,6 +19,13 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 BASE = tuple(f"base {axis}" for axis in AXES)
 
 
+def plain_fields(of: Any) -> dict[str, Any]:
+    """Fields of a dataclass, arrays as lists."""
+    values = {field.name: getattr(of, field.name) for field in dataclasses.fields(of)}
+    arrays = {n: x.tolist() for n, x in values.items() if isinstance(x, np.ndarray)}
+    return values | arrays
+
+
 @dataclasses.dataclass(frozen=True)
 class Tip:
     """The tip of the arm at N postures, in the measuring frame."""
@@ -243,13 +250,7 @@ class Sensor(abc.ABC):
 
     def to_dict(self) -> dict[str, Any]:
         """JSON with its kind."""
-        content: dict[str, Any] = {"kind": self.kind}
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            content[field.name] = (
-                value.tolist() if isinstance(value, np.ndarray) else value
-            )
-        return content
+        return {"kind": self.kind, **plain_fields(self)}
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Self:
