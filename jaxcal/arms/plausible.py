@@ -277,13 +277,13 @@ def mistaken_columns(arm: Chain, commands: Array, measured: Array) -> str:
     """
     turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
     pairs = [*itertools.combinations(turning, 2)]
-    tried: list[tuple[tuple[int, ...], str]]
-    tried = [((joint,), "reversed") for joint in turning]
-    tried += [(pair, "reversed") for pair in pairs]
+    tried = [(joints, "reversed") for joints in [*((i,) for i in turning), *pairs]]
     tried += [(pair, "exchanged") for pair in pairs]
-    errors = np.array(
-        [_error(arm, _undone(commands, *mistake), measured) for mistake in tried]
-    )
+    errors = np.zeros(len(tried))
+    for k, (joints, word) in enumerate(tried):
+        right, as_given = commands.copy(), commands[:, joints]
+        right[:, joints] = -as_given if word == "reversed" else as_given[:, ::-1]
+        errors[k] = _error(arm, right, measured)
     # The first, of one joint rather than two, that is as good as the best.
     best = int((errors > _SAME * errors.min()).argmin()) if len(errors) else -1
     if best < 0 or not errors[best] < _EXPLAINED * _error(arm, commands, measured):
@@ -303,15 +303,6 @@ def mistaken_columns(arm: Chain, commands: Array, measured: Array) -> str:
         f"{names} {verb} {word}: with that corrected, the readings agree with the "
         f"nominal arm; {remedy} {which}"
     )
-
-
-def _undone(commands: Array, joints: tuple[int, ...], word: str) -> Array:
-    right = commands.copy()
-    if word == "reversed":
-        right[:, joints] *= -1.0
-    else:
-        right[:, joints] = commands[:, joints[::-1]]
-    return right
 
 
 def _error(arm: Chain, commands: Array, measured: Array) -> float:

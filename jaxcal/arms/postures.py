@@ -298,11 +298,9 @@ def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:
                 "finds it from three views; on the command line --measured"
             )
         return arm, None
-    if places is not None and places.shape[1] != 4:
-        raise ValueError(
-            f"near must be rows (x, y, z, radius) for {sensor.kind}, got "
-            f"{places.shape[1]} columns"
-        )
+    if places is not None:
+        rule = f", rows (x, y, z, radius) for {sensor.kind}"
+        places = array_of("near", places, "N", 4, rule=rule)
     return arm, places
 
 

@@ -340,11 +340,10 @@ def _anywhere(fit: Fit, model: Chain, parts: list[Readings]) -> tuple[Readings, 
 
     NaN where none reads positions, and where nothing determines it.
     """
-    for part in parts:
-        if part.sensor.positions or isinstance(part.sensor, Socket):
-            break
-    else:
+    seen = [p for p in parts if p.sensor.positions or isinstance(p.sensor, Socket)]
+    if not seen:
         return parts[0], np.nan
+    part = seen[0]
     commands = fit.commands[fit.loss_weights > 0.0]
     joints = commands[:, : model.num_joints]
     columns = fit.commands[part.rows[:1], model.num_joints :]

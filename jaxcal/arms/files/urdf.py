@@ -181,34 +181,50 @@ def _read_joint(element: ElementTree.Element) -> Joint:
     name = _name(element, "joint")
     kind = element.get("type", "none")
 
-    def reference(tag: str, attribute: str) -> str:
+    def text(tag: str, attribute: str) -> str | None:
         child = element.find(tag)
-        link = None if child is None else child.get(attribute)
+        return None if child is None else child.get(attribute)
+
+    def reference(tag: str, attribute: str) -> str:
+        link = text(tag, attribute)
         if not link:
             raise ValueError(f"joint {name} has no <{tag} {attribute}=...>")
         return link
 
-    place = element.find("origin")
-    if place is not None and "quat_xyzw" in place.keys():
+    def values(tag: str, attribute: str, *default: float) -> Array:
+        words = text(tag, attribute)
+        if words is None:
+            return np.array(default)
+        try:
+            array = np.array([float(word) for word in words.split()])
+        except ValueError:
+            array = np.zeros(0)
+        if array.shape != (len(default),) or not np.isfinite(array).all():
+            count = {1: "a number", 3: "three numbers"}[len(default)]
+            raise ValueError(
+                f"{attribute} of <{tag}> of joint {name} must be {count}, got {words!r}"
+                + (f": a {_XACRO}" if "${" in words else "")
+            )
+        return array
+
+    if quaternion := text("origin", "quat_xyzw"):
         raise ValueError(
             f"<origin> of joint {name} must give its rotation as rpy in radians, got "
-            f"quat_xyzw={place.get('quat_xyzw')!r}"
+            f"quat_xyzw={quaternion!r}"
         )
     origin = np.eye(4)
-    origin[:3, 3] = _numbers(element, "origin", "xyz", (0.0, 0.0, 0.0), name)
-    turn = _numbers(element, "origin", "rpy", (0.0, 0.0, 0.0), name)
+    origin[:3, 3] = values("origin", "xyz", 0.0, 0.0, 0.0)
+    turn = values("origin", "rpy", 0.0, 0.0, 0.0)
     origin[:3, :3] = Rotation.from_euler("xyz", turn).as_matrix()
-    axis = _numbers(element, "axis", "xyz", (1.0, 0.0, 0.0), name)
+    axis = values("axis", "xyz", 1.0, 0.0, 0.0)
     length = np.linalg.norm(axis)
     if _KINDS.get(kind) and not length > 0.0:
         raise ValueError(f"the axis of joint {name} must not be zero")
     mimic = None
     if element.find("mimic") is not None:
-        (times,) = _numbers(element, "mimic", "multiplier", (1.0,), name)
-        (plus,) = _numbers(element, "mimic", "offset", (0.0,), name)
-        mimic = (reference("mimic", "joint"), float(times), float(plus))
-    (low,) = _numbers(element, "limit", "lower", (0.0,), name)
-    (high,) = _numbers(element, "limit", "upper", (0.0,), name)
+        times, plus = values("mimic", "multiplier", 1.0), values("mimic", "offset", 0.0)
+        mimic = reference("mimic", "joint"), float(times[0]), float(plus[0])
+    (low,), (high,) = values("limit", "lower", 0.0), values("limit", "upper", 0.0)
     limited = kind in ("revolute", "prismatic") and low < high
     return Joint(
         name,
@@ -220,30 +236,6 @@ def _read_joint(element: ElementTree.Element) -> Joint:
         mimic,
         (float(low), float(high)) if limited else (-np.inf, np.inf),
     )
-
-
-def _numbers(
-    joint: ElementTree.Element,
-    tag: str,
-    attribute: str,
-    default: tuple[float, ...],
-    name: str,
-) -> Array:
-    element = joint.find(tag)
-    text = None if element is None else element.get(attribute)
-    if text is None:
-        return np.array(default)
-    try:
-        values = np.array([float(word) for word in text.split()])
-        if values.shape != (len(default),) or not np.isfinite(values).all():
-            raise ValueError
-    except ValueError:
-        count = {1: "a number", 3: "three numbers"}[len(default)]
-        raise ValueError(
-            f"{attribute} of <{tag}> of joint {name} must be {count}, got {text!r}"
-            + (f": a {_XACRO}" if "${" in text else "")
-        ) from None
-    return values
 
 
 def led(
@@ -404,9 +396,8 @@ def _row(frame: Array, axis: Array, point: Array) -> Array:
         if a < -1e-12 or (abs(a) <= 1e-12 and normal[0] < 0.0):
             normal, a = -normal, -a
         # The foot of the common normal on the next axis has this height on ours.
-        along = -(point @ np.array([-normal[1], normal[0], 0.0])) / (
-            axis @ np.array([-normal[1], normal[0], 0.0])
-        )
+        across = np.array([-normal[1], normal[0], 0.0])
+        along = -(point @ across) / (axis @ across)
         d = point[2] + along * axis[2]
     else:
         normal = np.array([point[0], point[1], 0.0])
@@ -417,7 +408,7 @@ def _row(frame: Array, axis: Array, point: Array) -> Array:
     across = np.array([-normal[1], normal[0], 0.0])
     beta = np.arcsin(np.clip(axis @ normal, -1.0, 1.0))
     alpha = np.arctan2(-(axis @ across), axis[2])
-    row = np.array([a, *np.degrees([alpha]), d, *np.degrees([theta, beta])])
+    row = np.array([a, np.degrees(alpha), d, np.degrees(theta), np.degrees(beta)])
     return np.where(np.abs(row) < 1e-13, 0.0, row)
 
 
