@@ -196,10 +196,8 @@ class SerialChain(Arm, Model):
             base: link that the outputs are relative to, anywhere in the tree; else the
                 root.
             tip: link whose origin is the measured point; else the only last one.
-            sensor: measures the tip; Position() when not given.
             locked: fixed joints by name, with their values: degrees, metres.
-            limits: least and greatest command of joints, by name, instead of the
-                file's.
+            limits: of joints, by name, instead of the file's.
             options: ``gears``, ``compliance``, ``loads``, ``gravity`` of ``from_dh``.
         """
         arm = read_urdf(path, tip, base, locked or {})
@@ -219,7 +217,6 @@ class SerialChain(Arm, Model):
         Args:
             path: the .yaml, as of ``calibration.to_ur_kinematics``; from the robot's
                 base to its flange.
-            sensor: measures the tip; Position() when not given.
             options: of ``from_dh`` beside the table: ``tool``, ``base``, ``limits``.
         """
         return cls.from_dh(**(read_ur_kinematics(path) | options), sensor=sensor)

@@ -164,9 +164,13 @@ class ArmOptions:
             return self.read(path, table)
         if self != ArmOptions():
             raise ValueError("options of an arm need --model FILE.urdf")
-        if path and path.lower().endswith(".py"):
-            return _run_model(path)
-        return None if path is None else _read_model(path)
+        if path is None:
+            return None
+        try:
+            ending = path.lower().endswith(".py")
+            return _run_model(path) if ending else _read_model(path)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
     def columns(
         self,
@@ -294,37 +298,28 @@ def _run_model(path: str) -> Model:
     try:
         module = importlib.import_module(file.stem)
     except Exception as error:
-        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+        raise ValueError(f"{type(error).__name__}: {error}") from error
     if pathlib.Path(getattr(module, "__file__", None) or "").resolve() != file:
-        raise ValueError(
-            f"{path}: rename this file; another module is named {file.stem}"
-        )
+        raise ValueError(f"rename this file; another module is named {file.stem}")
     if not hasattr(module, "model"):
-        raise ValueError(f"{path}: it must set `model`, of jaxcal.models")
-    try:
-        return as_model(module.model)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError("it must set `model`, of jaxcal.models")
+    return as_model(module.model)
 
 
 def _read_model(path: str) -> Model:
     if path.lower().endswith(".xacro"):
-        raise ValueError(f"{path}: expand it first: xacro {path} > arm.urdf")
+        raise ValueError(f"expand it first: xacro {path} > arm.urdf")
     try:
         read = json.loads(pathlib.Path(path).read_text(encoding="utf-8-sig"))
     except ValueError:
         raise ValueError(
-            f"{path}: --model takes an arm (.urdf), a saved model (.json) or a Python "
-            "file (.py)"
+            "--model takes an arm (.urdf), a saved model (.json) or a Python file (.py)"
         ) from None
     if isinstance(read, dict) and read.get("format") == "jaxcal-calibration":
         raise ValueError(
-            f"{path}: this is a calibration, and a model is needed. `predict` and "
-            "`command` take calibrations"
+            "this is a calibration, and a model is needed. `predict` and `command` "
+            "take calibrations"
         )
     from jaxcal.models import from_dict
 
-    try:
-        return from_dict(read)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return from_dict(read)
