@@ -56,11 +56,8 @@ _SURE = 3.0  # standard errors of a play
 
 
 def default_prior(arm: Chain) -> Prior:
-    """Loose knowledge of any arm, by the length of its links; see the constants.
-
-    What the sensor cannot see is held; the groups' scales are taken from the
-    readings.
-    """
+    """Loose knowledge of any arm, by the length of its links; what the sensor cannot
+    see is held, and the groups' scales are taken from the readings."""
     length = arm.length or np.inf  # axes of unknown stroke alone
     joint = [_LENGTH * length, _TWIST, _LENGTH * length, _ZERO, _TWIST]
     mounting = [_MOUNTING * length] * 3 + [_MOUNTING_ANGLE] * 3

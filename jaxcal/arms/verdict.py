@@ -93,11 +93,6 @@ class ArmVerdict(models.Verdict):
         return self.errors[0].held_out if self.errors else np.nan
 
     @property
-    def interval(self) -> tuple[float, float]:
-        """95 % of ``held_out``."""
-        return self.errors[0].interval if self.errors else (np.nan, np.nan)
-
-    @property
     def nominal(self) -> float:
         """Mean error of the nominal machine, in the first unit."""
         return self.errors[0].nominal if self.errors else np.nan

@@ -36,7 +36,8 @@ def test_good_contacts_get_a_good_verdict():
     found = _fit("panda_1", *PLACE)
     verdict = found.verdict
     assert verdict.good and verdict.held_out < 0.05 * verdict.nominal
-    assert verdict.interval[0] < verdict.held_out < verdict.interval[1]
+    low, high = verdict.errors[0].interval
+    assert low < verdict.held_out < high
     assert not [why for why in verdict.reasons if "moved" in why]
     assert "Cross-validated error" in found.summary()
 
