@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.chain_kernel import forward
-from jaxcal.arms.files.urdf import joints_of
 from jaxcal.arms.sensors import Reading, Sensor, Tip
 from jaxcal.arms.sensors.sensor import BASE, Readings
 from jaxcal.checks import Array, array_of, numbers
@@ -114,18 +113,6 @@ class Arm:
         if self.joint_names == numbered(self.num_joints):
             return ()
         return (*self.joint_names, *self.sensor.inputs)
-
-    @functools.cached_property
-    def command_units(self) -> tuple[str, ...]:
-        """J units of the joints' columns, "deg" or "length"."""
-        # A column drives itself by one, its gear ratio apart.
-        at = np.abs(np.abs(self.drive) - 1.0).argmin(axis=0)
-        kinds = [self.joints[joint] for joint in at]
-        plain = self.drive[at, range(len(at))] == 1.0
-        if self.source is not None and not plain.all():
-            in_file = joints_of(self.source["text"])
-            kinds = [in_file[name].kind for name in self.joint_names]
-        return tuple("deg" if kind == "R" else "length" for kind in kinds)
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:

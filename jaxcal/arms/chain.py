@@ -23,7 +23,7 @@ from jaxcal.arms.arguments import (
     transform,
 )
 from jaxcal.arms.arm import Arm, Load, apparent_length, numbered
-from jaxcal.arms.files.urdf import read_ur_kinematics, read_urdf
+from jaxcal.arms.files.urdf import joints_of, read_ur_kinematics, read_urdf
 from jaxcal.arms.sensors import Position, Sensor, Several
 from jaxcal.arms.sensors.sensor import plain_fields
 from jaxcal.arms.sensors.several import OneTable, stacked
@@ -343,6 +343,18 @@ class SerialChain(Arm, Model):
             noise = one.stds(self.length)
             named.append(OneTable(one.kind, i, [*range(j), *at], noise, *pair))
         return stacked(named, j, self.num_inputs, self.num_outputs)
+
+    @functools.cached_property
+    def command_units(self) -> tuple[str, ...]:
+        """J units of the joints' columns, "deg" or "length"."""
+        # A column drives itself by one, its gear ratio apart.
+        at = np.abs(np.abs(self.drive) - 1.0).argmin(axis=0)
+        kinds = [self.joints[joint] for joint in at]
+        plain = self.drive[at, range(len(at))] == 1.0
+        if self.source is not None and not plain.all():
+            in_file = joints_of(self.source["text"])
+            kinds = [in_file[name].kind for name in self.joint_names]
+        return tuple("deg" if kind == "R" else "length" for kind in kinds)
 
     def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
         return self.quantities_of(self.sensor, measured_unit)
