@@ -4,9 +4,18 @@
 ``jaxcal/commands/evaluate.py`` holds it.
 """
 
-import sys
+from __future__ import annotations
 
-from jaxcal.commands import evaluate
+import sys
+from collections.abc import Sequence
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Evaluate, print, write; the exit code."""
+    from jaxcal.commands import evaluate
+
+    return evaluate.main(arguments, prog="evaluate.py")
+
 
 if __name__ == "__main__":
-    sys.exit(evaluate.main(prog="evaluate.py"))
+    sys.exit(main())

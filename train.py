@@ -3,9 +3,18 @@
 ``jaxcal train`` is the same; ``jaxcal/commands/train.py`` holds it.
 """
 
-import sys
+from __future__ import annotations
 
-from jaxcal.commands import train
+import sys
+from collections.abc import Sequence
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Train and save; the exit code."""
+    from jaxcal.commands import train
+
+    return train.main(arguments, prog="train.py")
+
 
 if __name__ == "__main__":
-    sys.exit(train.main(prog="train.py"))
+    sys.exit(main())
