@@ -481,6 +481,7 @@ class Chains(Model):
         return dataclasses.replace(self, chains=tuple(arms))
 
     def writable(self) -> Self:
+        """All with stiff joints and round gears, as files have them."""
         return self._each(SerialChain.writable)
 
     def to_dict(self) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 import warnings
@@ -66,7 +65,7 @@ class Fit:
             if isinstance(value, np.ndarray):
                 fields[name] = value = np.array(value)
                 value.flags.writeable = False
-        fields["provenance"] = copy.deepcopy(dict(self.provenance))
+        fields["provenance"] = _copied(self.provenance)
 
     # -- parameters --------------------------------------------------------------------
 
@@ -363,6 +362,15 @@ def above_rounding(variance: Array, rows: Array, covariance: Array) -> Array:
     P) may cancel to zero or less: that is not known to be certain."""
     terms = (rows**2 * np.diag(covariance)).sum(axis=-1)
     return np.asarray(np.maximum(variance, np.finfo(np.float64).eps * terms))
+
+
+def _copied(content: Any) -> Any:
+    """A copy of what JSON can hold."""
+    if isinstance(content, str):
+        return content
+    if isinstance(content, Mapping):
+        return {key: _copied(value) for key, value in content.items()}
+    return [*map(_copied, content)] if isinstance(content, list) else content
 
 
 def say_far(

@@ -135,7 +135,7 @@ class FitSolution:
             zero = problem.free & from_zero
             self.parameters = np.where(zero, 0.0, problem.mean)
             self.commands = problem.commands
-            self._predict()
+            self._predict(problem.measured if from_zero and self.all_free else None)
             self.weights = np.ones(len(problem.measured))
             self.sizes = problem.model.parameter_sizes()
             self.level = self._first_level()
@@ -189,9 +189,11 @@ class FitSolution:
         growth = self._grown[1]
         return white if growth is None else white / growth[..., None]
 
-    def _predict(self) -> None:
+    def _predict(self, residuals: Array | None = None) -> None:
         """Residuals at the present parameters and commands."""
-        self.residuals = self._off(self.commands, self.parameters)
+        if residuals is None:
+            residuals = self._off(self.commands, self.parameters)
+        self.residuals = residuals
         self.white = self.whitened(self.residuals[..., None])[..., 0]
 
     def _off(self, commands: Array, theta: Array, finite: bool = True) -> Array:

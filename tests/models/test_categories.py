@@ -68,7 +68,7 @@ def test_words_of_a_frame_are_chosen_from_fitted_and_predicted():
     masked = TABLE.assign(available=TABLE.index > 0)
     masked.loc[0, "material"] = None
     assert 0 not in jaxcal.select(masked, 6, model=MODEL).indices
-    with pytest.raises(ValueError, match="row 0, column 'material' must be finite"):
+    with pytest.raises(ValueError, match="row 0, column 'material' must hold a number"):
         jaxcal.select(masked.drop(columns="available"), 6, model=MODEL)
 
 
