@@ -28,11 +28,10 @@ from jaxcal.models.uncertainty import Noise, Prior
 class Chains(Model):
     """Chains by the names of their tips; shared parameters occur once.
 
-    Chains that begin with the same joints (a torso's) share these joints' columns, and
-    the parameters of the links between them. A sensor that is given to several chains
-    as one object, by itself or in ``Several``, is one: both arms touch the same
-    sockets, which are found from the arm that reads them most. All else is each chain's
-    own, named ``left: a3``.
+    Chains that begin with the same joints (a torso's) share their columns, and the
+    parameters of the links between. A sensor that is given to several chains as one
+    object, by itself or in ``Several``, is one: both arms touch the same sockets, found
+    from the arm that reads them most. All else is each chain's own, ``left: a3``.
 
     Commands are the columns of all joints, 0 where they are not of the row's chain;
     ``chain``, which says of each row whose tip was read, from 0; and the sensors'
