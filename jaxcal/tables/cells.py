@@ -17,12 +17,14 @@ _MARKED = re.compile(r"[+-]?\d*(?:[.,]\d+)+(?:[eE][+-]?\d+)?")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")  # or three decimals
 _MISSING = {"", "na", "n/a", "#n/a", "nan", "null", "none", "nat", "<na>"}
 _TRUTHS = {"true": 1.0, "yes": 1.0, "false": 0.0, "no": 0.0, "1": 1.0, "0": 0.0}
+_WITH_UNIT = re.compile(r"[+-]?\d*[.,]?\d+[.,]?(?:[eE][+-]?\d+)?\s*(?P<unit>[^\s\d].*)")
 UNIT = re.compile(
     r"[\[(].*[\])]|[-%°‰]|(?:[/.·*^ ²³0-9-]|[pnuµμmckMGh]?(?:deg|rad|m|s|g|V|A|W|N|Hz"
     r"|Pa|bar|Ω|l|L|C|F|K|J|rpm|min|h|psi|in|inch|°C|°F|°|%|ct|cts|counts?|steps?|pulses?"
     r"|degrees?|radians?|volts?|sec|seconds?|T|S|Ohm|ppm|dB|lx|px|LSB|mmHg|RH|rev"
     r"|arcsec|arcmin|a\.u\.|ε))+"
 )
+_FORTRAN = re.compile(r"[+-]?\d*\.?\d+\.?[dD][+-]?\d+")
 _LEAST = 100.0  # a whole number beside 14.036 that makes that one doubtful
 _OTHER = {".": ",", ",": "."}
 
@@ -38,6 +40,19 @@ def is_number(cell: str) -> bool:
     """Whether a cell is a number in whatever way it is written."""
     cell = _plain(cell)
     return _float(cell) is not None or _MARKED.fullmatch(cell) is not None
+
+
+def has_unit(cells: Sequence[str]) -> bool:
+    """Whether all cells are numbers with their unit, 12.5 mm or 7%, or fractions."""
+    parts = [_WITH_UNIT.fullmatch(_plain(cell)) for cell in cells if cell]
+    if None in parts or len(parts) < 2:
+        return False
+    units = {part["unit"] for part in parts if part}
+    if any(unit[0] == "/" for unit in units):
+        return all(unit[1:].isdecimal() for unit in units)
+    unit = units.pop()
+    sure = len(unit) > 1 or unit in "%°" or not {*".,"}.isdisjoint("".join(cells))
+    return not units and sure and UNIT.fullmatch(unit) is not None
 
 
 def decimal_mark(cells: Sequence[str], semicolons: bool) -> tuple[str, bool]:
@@ -111,6 +126,8 @@ def _number(cell: str, mark: str) -> float | None:
 
 
 def _float(cell: str) -> float | None:
+    if _FORTRAN.fullmatch(cell):
+        cell = cell.lower().replace("d", "e")
     try:
         return None if "_" in cell else float(cell)
     except ValueError:

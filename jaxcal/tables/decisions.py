@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxcal.checks import Array
-from jaxcal.tables.cells import truths_of
+from jaxcal.tables.cells import has_unit, truths_of
 
 COMMANDS, MEASURED = "u_", "y_"  # how the names of columns begin
 _LOG = logging.getLogger("jaxcal")
@@ -67,8 +67,7 @@ def decide(
         elif name.startswith(COMMANDS):
             decision = Decision("input")
         elif name in table.labels:
-            truths = truths_of(table.labels[name], ("true", "false"))
-            decision = Decision("label", "words" if truths is None else "TRUE, FALSE")
+            decision = _of_words(table.labels[name])
         else:
             column = table.values[:, table.names.index(name)]
             decision = _of_numbers(name, column, table.header, marked, outputs, fit)
@@ -79,6 +78,14 @@ def decide(
                 decisions[name] = Decision("input", "the only one")
                 break
     return decisions if marked else decisions | _counting(table, decisions)
+
+
+def _of_words(cells: Sequence[str]) -> Decision:
+    if has_unit(cells):
+        cell = next(filter(None, cells))
+        return Decision("label", f"holds numbers and units, {cell!r}", asks=True)
+    truths = truths_of(cells, ("true", "false"))
+    return Decision("label", "words" if truths is None else "TRUE, FALSE")
 
 
 def is_available(name: str) -> bool:

@@ -75,6 +75,7 @@ def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
     _, header = rows[0]
     mark = decimal_mark([cell for _, row in rows for cell in row], delimiter != ",")
     if not headed:
+        _require_decimals(source, rows, delimiter)
         header = [f"u_{axis_letter(i, len(header))}" for i in range(len(header))]
     elif numbers := [cell for cell in header if _is_plain(cell)]:
         name = next(cell for cell in header if not _is_plain(cell))
@@ -98,6 +99,20 @@ def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
     if not table.names:
         raise ValueError(f"{source}: no column contains numbers: {', '.join(header)}")
     return table, notes
+
+
+def _require_decimals(
+    source: str, rows: list[tuple[int, list[str]]], delimiter: str
+) -> None:
+    """Refuse numbers that decimal commas have cut into two cells each: -0,79."""
+    width = len(rows[0][1])
+    whole = all(cell.lstrip("+-").isdecimal() for _, row in rows for cell in row)
+    for line, row in rows if whole and delimiter == "," and width % 2 == 0 else ():
+        if any(cell in ("-0", "+0") or re.match(r"0\d", cell) for cell in row):
+            raise ValueError(
+                f"{source}: line {line} may hold {width // 2} numbers with decimal "
+                f"commas, or {width} whole ones: separate cells with semicolons"
+            )
 
 
 def _is_plain(cell: str) -> bool:

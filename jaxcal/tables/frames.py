@@ -123,7 +123,7 @@ def of_frame(
     if names is None:
         return frame
     columns = [_column(frame, name) for name in names]
-    shape = np.shape(columns[0])
+    shape = np.broadcast_shapes(*map(np.shape, columns))
     cells = [_cells(np.ravel(column)) for column in columns]
     named = dict(zip(names, cells, strict=True))
     table = table_of(argument, named, range(math.prod(shape)), None, row="row")
@@ -151,9 +151,11 @@ def say_order(commands: Any, measured: Any) -> None:
 
 
 def _collected(frame: Any) -> Any:
-    """A lazy frame read."""
+    """A lazy frame read, and a series of structs as a frame."""
     lazy = hasattr(frame, "collect") and not hasattr(frame, "to_numpy")
-    return frame.collect() if lazy else frame
+    frame = frame.collect() if lazy else frame
+    structs = getattr(getattr(frame, "struct", None), "fields", ())  # of polars
+    return frame.struct.unnest() if structs else frame
 
 
 def names_in(
@@ -167,6 +169,7 @@ def names_in(
     these and ``beside`` are said."""
     header = header_of(argument, frame)
     if not header:
+        _require_no_rows_of(argument, frame, wanted, prefix)
         return None
     try:
         names = columns_by_name(wanted, header, prefix)
@@ -182,6 +185,21 @@ def names_in(
         if spare:
             say(f"{argument}: {spare}")
     return tuple(names)
+
+
+def _require_no_rows_of(
+    argument: str, frame: Any, wanted: Sequence[str], prefix: str
+) -> None:
+    """Refuse a frame, or an array of xarray, whose rows have the columns' names."""
+    rows: Any = getattr(frame, "index", ())
+    if _is_labelled(frame):
+        axis = frame.coords.get(frame.dims[0]) if frame.ndim > 1 else None
+        rows = () if axis is None else axis.values.tolist()
+    rows = [] if callable(rows) else [row for row in rows if isinstance(row, str)]
+    if rows and None not in columns_by_name(wanted, rows, prefix):
+        raise ValueError(
+            f"{argument}: {', '.join(rows)} are names of rows; transpose it (.T)"
+        )
 
 
 def table_of_frame(argument: str, frame: Any) -> Table:

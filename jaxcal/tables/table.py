@@ -190,6 +190,12 @@ class Table:
         for place, (name, decision) in enumerate(decisions.items(), start=1):
             if not decision.asks or decision.role == "output":
                 continue
+            if decision.role == "label":
+                or_choose = f", or choose the commands with {option}" if option else ""
+                raise ValueError(
+                    f"{self.source}: column {name!r} {decision.reason}: write the "
+                    f"number alone in each cell{or_choose}"
+                )
             if self.row != "line":
                 decisions[name] = Decision("input", decision.reason)
                 continue

@@ -233,10 +233,33 @@ def test_words_below_the_header_are_no_units():
         parse("t.csv", b"u_a,u_b\nfast,slow\n1,2\n3,4\n5,9\n").columns(["u_a"])
 
 
+@pytest.mark.parametrize(
+    "cells",
+    ["12.5 mm|7.25 mm|3.0 mm", "7%|9%|12%", "1/8|3/8|1/2", "90\u00b0|45\u00b0|0\u00b0"],
+)
+def test_numbers_with_their_unit_are_no_labels(cells):
+    rows = [f"{cell},{i}.5" for i, cell in enumerate(cells.split("|"))]
+    table = parse("t.csv", "\n".join(["a,b", *rows]).encode())
+    with pytest.raises(ValueError, match="column 'a' holds numbers and units"):
+        table.commands(None)
+    assert table.commands("b") == ("b",)
+
+
 def test_names_of_a_number_and_a_letter_are_labels():
     table = parse("t.csv", b"plate,a\n1A,3\n2A,4\n3A,9\n")
     with pytest.warns(UserWarning, match="'plate' is read as label"):
         assert table.commands(None) == ("a",)
+
+
+def test_exponents_of_fortran_are_read():
+    table = parse("t.csv", b"a,b\n1.1D+01,1\n-2.5d-1,4\n")
+    np.testing.assert_array_equal(table.values, [[11.0, 1.0], [-0.25, 4.0]])
+
+
+def test_decimal_commas_between_commas_are_refused_without_a_header():
+    cells = [f"{x:.2f}".replace(".", ",") for x in (0.04, -0.79, 12.5, 3.25)]
+    with pytest.raises(ValueError, match="line 1 may hold 2 numbers with decimal comm"):
+        parse("t.csv", f"{cells[0]},{cells[1]}\n{cells[2]},{cells[3]}\n".encode())
 
 
 def test_rows_that_r_numbers_between_commas_are_read():

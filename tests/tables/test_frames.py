@@ -226,3 +226,18 @@ def test_indices_that_only_overlap_are_said():
     measured = pandas.DataFrame({"y": 2.0 * np.arange(6.0)}, index=range(1, 7))
     with pytest.warns(UserWarning, match="indices that differ. Rows are paired"):
         jaxcal.identify(commands, measured)
+
+
+def test_names_of_rows_are_refused():
+    rng = np.random.default_rng(0)
+    commands = rng.normal(size=(9, 3))
+    fit = jaxcal.identify(
+        commands,
+        commands + 0.01 * rng.normal(size=(9, 3)),
+        output_names=["a", "b", "c"],
+    )
+    targets = pandas.DataFrame(np.eye(3), columns=["c", "a", "b"])
+    expected = np.stack([fit.command_for(row) for row in np.eye(3)[:, [1, 2, 0]]])
+    np.testing.assert_allclose(fit.command_for(targets), expected)
+    with pytest.raises(ValueError, match=r"c, a, b are names of rows; transpose it"):
+        fit.command_for(targets.T)
