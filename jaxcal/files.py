@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import pathlib
 import secrets
@@ -11,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import IO, Any
 
 _WRITTEN = {"out", "servos_out", "picture", "json"}  # arguments that are files
+_SHOWN = "/dev/stdout"  # where the shell has redirected it, that file
 _RECORDS = {".json", ".jsonl", ".toml", ".csv"}
 
 
@@ -120,6 +122,12 @@ def require_kept(given: Mapping[str, Any]) -> None:
                     f"--{option.replace('_', '-')}: {path} is what is read "
                     f"({name.replace('_', '-')}); write to another file"
                 )
+    for value in itertools.chain.from_iterable(read.values()):
+        shown = value != "-" and os.path.isfile(_SHOWN) and _same_file(_SHOWN, value)
+        if shown:
+            raise ValueError(
+                f"standard output goes to {value}, which is read; write to another file"
+            )
 
 
 def _same_file(path: Any, value: Any) -> bool:

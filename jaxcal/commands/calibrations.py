@@ -180,6 +180,28 @@ def is_arm(model: Any) -> bool:
     return isinstance(model, SerialChain)
 
 
+@dataclasses.dataclass
+class NoiseOptions:
+    """What is known of the noise beside --noise."""
+
+    RARE: ClassVar[bool] = True
+
+    play: Annotated[
+        float | None, "backlash of an arm's joints in degrees: hobby servos 0.3"
+    ] = None
+    weights: Annotated[str | None, "column of relative weights", "W"] = None
+
+    def noise(self, machine: Any, stds: list[float] | None) -> Any:
+        """``noise`` and ``noise_std`` of ``identify``, by --noise and --play."""
+        std = stds[0] if stds and len(stds) == 1 else stds
+        if self.play is None:
+            return {"noise_std": std}
+        if not is_arm(machine):
+            raise ValueError("--play needs an arm: --model FILE.urdf")
+        noise = machine.noise_with_play(self.play)
+        return {"noise": noise if std is None else dataclasses.replace(noise, std=std)}
+
+
 RecordPath = Annotated[
     str, "CSV, or - (standard input); for an arm also a bag or a LeRobot dataset"
 ]
@@ -207,6 +229,7 @@ def identify(
     of_arm: ArmOptions,
     recording: RecordingOptions,
     noise: Annotated[Numbers, "std of a measurement, if known", "S"] = None,
+    of_noise: NoiseOptions,
     command_unit: Annotated[str, "unit of the commands", "UNIT"] = "",
     measured_unit: Annotated[str, "unit of the readings", "UNIT"] = "",
     accuracy: Annotated[
@@ -234,13 +257,15 @@ def identify(
     saved.require(file, of_urdf, recording.servos)
     if against and not report:
         raise ValueError("--against needs --report FOLDER")
+    if saved.repair and of_noise.weights:
+        raise ValueError("--repair writes no weights: leave out --repair or --weights")
     table = recording.table(file, lambda which: of_arm.of_recording(model, which))
     table = read_table(file) if table is None else table
     machine: Any = of_arm.machine(model, table)
     if accuracy is not None and not is_arm(machine):
         raise ValueError("--accuracy needs an arm: --model FILE.urdf")
     commands, measured, names, columns = _readings(
-        of_arm, machine, table, inputs, outputs, of_urdf=of_urdf
+        of_arm, machine, table, inputs, outputs, of_noise.weights, of_urdf=of_urdf
     )
     if of_urdf and machine.sensor.lengths:  # files of this format are in metres
         measured_unit = measured_unit or "m"
@@ -248,7 +273,8 @@ def identify(
         commands,
         measured,
         model=machine,
-        noise_std=noise[0] if noise and len(noise) == 1 else noise,
+        **of_noise.noise(machine, noise),
+        weights=table.columns([of_noise.weights])[:, 0] if of_noise.weights else None,
         input_names=names,
         output_names=columns,
         command_unit=command_unit,
@@ -304,6 +330,7 @@ def _readings(
     table: Table,
     inputs: str | None,
     outputs: str | None,
+    weights: str | None,
     *,
     of_urdf: bool,
 ) -> tuple[Array, Array, Sequence[str], Sequence[str]]:
@@ -317,7 +344,7 @@ def _readings(
     columns = machine.sensor.outputs if of_urdf else table.outputs(outputs)
     if of_urdf and not contacts:
         columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
-    names = of_arm.columns(machine, table, inputs, columns)
+    names = of_arm.columns(machine, table, inputs, (*columns, weights or ""))
     commands = of_arm.commands(machine, table, names)
     if contacts:
         measured = np.zeros((len(table), len(columns)))

@@ -14,6 +14,7 @@ from typing import Annotated
 from jaxcal.arguments import Parser, exit_code, outdated, told, values_of
 from jaxcal.checks import aligned
 from jaxcal.commands.tables import write_json
+from jaxcal.extras import install
 from jaxcal.files import require_kept
 
 _HERE = {  # command: one line of help, and the module with its flags and function
@@ -39,6 +40,7 @@ _WHOLE = {  # commands that parse their own arguments
     "evaluate": ("compare methods with the proven optimum (evaluate.py)", "evaluate"),
 }
 COMMANDS = (*_HERE, *_WHOLE)
+_OTHERS = ("all", "bench", "dev", "docs")  # extras that name others, or are not used
 _EPILOG = """\
 examples:
   jaxcal select candidates.csv -k 4                 the four rows to measure
@@ -111,10 +113,9 @@ def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
         "cores": str(os.cpu_count()),
         "jaxcal": _version("jaxcal", "a checkout that is not installed"),
     }
-    for line in importlib.metadata.requires("jaxcal") or []:
-        package = re.split(r"[^\w.-]", line)[0]
-        if package != "jaxcal" and not re.search("extra == .(bench|dev|docs)", line):
-            versions[package] = _version(package, "not installed")
+    for package, extra in _required().items():
+        more = f": {install(extra)}" if extra else ""
+        versions[package] = _version(package, f"not installed{more}")
     versions["devices"] = _devices()
     cache = "JAX_COMPILATION_CACHE_DIR"
     versions[cache] = os.environ.get(cache, "not set")
@@ -122,6 +123,20 @@ def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
         write_json("", versions)
         return
     print("\n".join(aligned([*versions.items()], "<")))
+
+
+def _required() -> dict[str, str]:
+    """Packages, and the smallest extra that brings each; "" of those always there."""
+    of_extra: dict[str, list[str]] = {}
+    for line in importlib.metadata.requires("jaxcal") or []:
+        asked = re.match(r"([\w.-]+)(?:.*extra == ['\"](\w+)['\"])?", line)
+        if asked and asked[2] not in _OTHERS and asked[1] != "jaxcal":
+            of_extra.setdefault(asked[2] or "", []).append(asked[1])
+    extras: dict[str, str] = {}
+    for extra in sorted(of_extra, key=lambda name: (name != "", len(of_extra[name]))):
+        for package in of_extra[extra]:
+            extras.setdefault(package, extra)
+    return extras
 
 
 def _version(package: str, missing: str) -> str:

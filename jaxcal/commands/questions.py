@@ -14,16 +14,19 @@ from jaxcal.arguments import Numbers, Was, levels, several
 from jaxcal.commands.arms import ArmOptions, ModelPath
 from jaxcal.commands.tables import Output, TablePath
 from jaxcal.information.singular import require_excited
-from jaxcal.selection import Design, Selection
+from jaxcal.selection import Design, Selection, Worst
 from jaxcal.selection.criteria import CRITERIA, offered
 from jaxcal.tables import Table, read_table
 
 Names = Annotated[list[str] | None, several(str, "names")]
+Rows = Annotated[list[int] | None, several(int, "whole numbers")]
 
 
 @dataclasses.dataclass
 class DesignOptions:
     """The problem that a table of candidates and these options describe."""
+
+    RARE: ClassVar[Any] = {"required", "scenarios"}
 
     inputs: Annotated[
         str | None,
@@ -36,6 +39,10 @@ class DesignOptions:
         Numbers, "standard deviation of a measurement: one, or one per output", "S"
     ] = None
     replicates: Annotated[int, (1,), "how often a row may be measured", "R"] = 1
+    required: Annotated[Rows, "rows that must be chosen, counted from 0", "I,J"] = None
+    scenarios: Annotated[
+        int | None, "average over this many random draws of the model's parameters", "N"
+    ] = None
 
     def design(self, table: Table, of_arm: ArmOptions) -> Design:
         """The design of the candidates in a table."""
@@ -52,7 +59,9 @@ class DesignOptions:
             model,
             noise=None if self.noise is None else _one_or_all(self.noise),
             available=mask,
+            required=self.required,
             max_replicates=self.replicates,
+            scenarios=self.scenarios,
             names=table.row_names,
         )
         design.candidate_set.axes = names
@@ -90,7 +99,12 @@ class MethodOptions:
     time_limit: Annotated[float | None, "for auto and exact; default 10", "SECONDS"] = (
         None
     )
+    best: Annotated[int | None, "with exact: prove the B best selections", "B"] = None
     checkpoint: Annotated[str | None, "with policy: a trained policy", "DIR"] = None
+    worst: Annotated[bool, "with --scenarios: by the worst, not the mean"] = False
+    between: Annotated[
+        bool, "then refine the chosen rows between the candidates, within their range"
+    ] = False
 
 
 def _scored(given: str, table: Table) -> NDArray[np.int64]:
@@ -142,11 +156,28 @@ def select(
     are kept as labels. Without --k the fewest rows that identify the model are chosen.
     """
     table = read_table(file)
-    options = {name: x for name, x in vars(of_method).items() if x is not None}
+    given = vars(of_method).items()
+    options = {name: x for name, x in given if x is not None and x is not False}
     design = of_design.design(table, of_arm)
     wanted = _criterion(criterion, parameters)
+    if options.pop("worst", False):
+        if of_design.scenarios is None:
+            raise ValueError("--worst needs --scenarios N")
+        wanted = Worst(wanted)
     if score is None:
+        between = options.pop("between", False)
         selection = design.select(k, wanted, method, **options)
+        if between and of_arm.kind != "position":
+            raise ValueError(
+                "--between needs a sensor that reads everywhere, not --sensor "
+                f"{of_arm.kind}. In Python: design.refine(..., allowed=arm.reachable())"
+            )
+        if between:
+            refined = design.refine(selection, criterion=wanted)
+            names, rows = list(design.axes or ()), refined.commands.tolist()
+            if not output.written(names, rows, refined.to_dict()):
+                print(refined)
+            return
     else:
         if others := [f"--{name.replace('_', '-')}" for name in sorted(options)]:
             raise ValueError(f"Leave out with --score: {', '.join(others)}")

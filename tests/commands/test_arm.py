@@ -65,6 +65,7 @@ def test_contacts_become_a_calibrated_file(files, capsys):
             "--tip takes one link, got left,right. Several chains",
         ),
         (["--tip", "left", "--tip", "right"], "takes one link, got left,right"),
+        (["--radians", "--play", "-1"], "play must not be negative"),
         (["--radians", "--distance", "0,1,0.05"], "distances must be rows"),
         (["--radians", "--sensor", "plane", "--distance", "0,1,2,3"], "needs --sensor"),
         (["--radians", "--base", "panda_rightfinger"], "there is no column"),
@@ -107,6 +108,12 @@ def test_contacts_are_chosen_from_a_table(files, capsys):
     _, q, socket = contacts_of_a_panda("front")
     contacts = np.column_stack([np.degrees(q), socket])
     assert set(rows[:, 0]) == set(select(contacts, 12, "exchange", model=arm).indices)
+    several = ["--scenarios", "2", "--worst", "--criterion", "D"]
+    assert main([*given[:-1], *sensor, *several]) == 0
+    told = capsys.readouterr().out
+    assert "log det S, worst" in told and "scenarios     2" in told
+    assert main([*given, *sensor, "--worst"]) == 2
+    assert "--worst needs --scenarios N" in capsys.readouterr().err
     assert main([*given, *sensor[:-1]]) == 2
     assert "are they radians" in capsys.readouterr().err
     assert main(["select", str(table), "-k", "4", "--radians"]) == 2

@@ -102,6 +102,7 @@ def test_score_judges_what_select_wrote(tmp_path, candidates, capsys):
     assert judged["log_det"] == again["log_det"]
     assert 0.0 < judged["efficiency"] <= 1.0
     assert main([*asked, chosen, "-k4"]) == 2
+    assert main([*asked, chosen, "--best=2"]) == 2
 
 
 def test_names_of_0_2_work_and_warn(candidates, capsys):
@@ -341,7 +342,7 @@ def test_an_arm_is_read_from_urdf(tmp_path):
 
 
 def test_rare_options_are_in_the_help_that_asks_for_all(capsys):
-    words = ("--seed", "--time-limit", "--checkpoint", "--tip")
+    words = ("--seed", "--best", "--between", "--required", "--checkpoint", "--tip")
     for asked, shown in ((["--help"], False), (["--help", "all"], True)):
         with pytest.raises(SystemExit) as ended:
             main(["select", *asked])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -63,6 +65,19 @@ def test_nor_is_one_that_comes_over_standard_input(ask, monkeypatch, tmp_path):
         monkeypatch.setattr("sys.stdin", file)
         code, _, said = ask("select - -k 4 --out t.csv")
     assert code == 2 and "t.csv is what is read" in said
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no /dev/stdout")
+def test_nor_is_one_that_the_shell_writes_to(ask, tmp_path):
+    before = (tmp_path / "t.csv").read_bytes()
+    command = [sys.executable, "-m", "jaxcal", "select", "t.csv", "-k", "4", "--csv"]
+    with open("t.csv", "ab") as file:
+        ended = subprocess.run(command, stdout=file, stderr=subprocess.PIPE, text=True)
+    assert ended.returncode == 2
+    assert "standard output goes to t.csv, which is read" in ended.stderr
+    assert (tmp_path / "t.csv").read_bytes() == before
+    with open("plan.csv", "ab") as file:
+        assert subprocess.run(command, stdout=file).returncode == 0
 
 
 @pytest.mark.parametrize(

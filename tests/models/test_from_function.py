@@ -342,6 +342,12 @@ def test_a_file_of_python_is_a_model_on_the_command_line(tmp_path, capsys):
     assert code == 0 and "2 of 17 candidates are left out" in told.err
     code, told = run("decay_of_another_shape", "[1.0, 2.0]")
     assert code == 2 and "f must return (1,) for every command, got (2,)" in told.err
+    file = str(tmp_path / "decay_that_is_nan.py")
+    words = [str(table), "-k", "2", "--model", file, "--criterion", "D"]
+    assert jaxcal_main(["select", *words, "--between", "--csv"]) == 0
+    name, *times = capsys.readouterr().out.split()
+    assert name == "time"  # 0 and 1 / rate, by hand
+    np.testing.assert_allclose(sorted(map(float, times)), [0.0, 2.0], atol=1e-2)
     (tmp_path / "nothing.py").write_text("x = 1\n")
     code = jaxcal_main(["select", str(table), "--model", str(tmp_path / "nothing.py")])
     assert code == 2 and "it must set `model`" in capsys.readouterr().err
