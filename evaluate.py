@@ -4,18 +4,9 @@
 ``jaxcal/commands/evaluate.py`` holds it.
 """
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Sequence
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Evaluate, print, write; the exit code."""
-    from jaxcal.commands import evaluate
-
-    return evaluate.main(arguments, prog="evaluate.py")
-
+from jaxcal.commands.evaluate import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(prog="evaluate.py"))

@@ -3,18 +3,9 @@
 ``jaxcal train`` is the same; ``jaxcal/commands/train.py`` holds it.
 """
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Sequence
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Train and save; the exit code."""
-    from jaxcal.commands import train
-
-    return train.main(arguments, prog="train.py")
-
+from jaxcal.commands.train import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(prog="train.py"))
