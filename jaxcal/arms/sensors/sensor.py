@@ -255,7 +255,8 @@ class Sensor(abc.ABC):
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Self:
         """The sensor that ``to_dict`` wrote."""
-        gone = ("kind", "distortion")  # a board's, which only 0.2 used
+        own = {field.name for field in dataclasses.fields(cls)}
+        gone = {"kind", "distortion"} - own  # the latter a board's, which only 0.2 used
         return cls(**{key: content[key] for key in content if key not in gone})
 
 
