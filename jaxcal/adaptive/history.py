@@ -12,8 +12,10 @@ import numpy as np
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.particles import ParticleBelief, outcome_shape
 from jaxcal.adaptive.session import SequentialTask, Session, jit_by_class
-from jaxcal.checks import array_of, in_words, whole_number
+from jaxcal.checks import Array, array_of, in_words, numbers, whole_number
 from jaxcal.checks import seconds as checked_seconds
+
+_NEAR = 1e-5  # of a coordinate's range: tolerance for coordinates of a design
 
 
 def begin(
@@ -59,15 +61,15 @@ def checked_entry(
 ) -> tuple[Any, jax.Array]:
     """Design and outcome as the task has them, of a measurement that can be paid.
 
-    A design is an index where the task has a table ``designs``; other tasks take
-    designs as their options have them.
+    A task with a table ``designs`` (A, e) takes a whole number as an index of it and
+    anything else as coordinates; other tasks take designs as their options have them.
 
     Raises:
         ValueError: naming the entry, the rule and the value.
     """
     table = getattr(loop.task, "designs", None)
     if table is not None:
-        design = _index(f"{where}: design", design, len(table))
+        design = _row(f"{where}: design", design, np.asarray(table, np.float64))
     else:
         design = _as_options(loop, design, f"{where}: design")
     of_kind = _of_table if isinstance(loop.task, GridTask) else _of_particles
@@ -157,6 +159,31 @@ def _like(loop: Any) -> Any:
     """Shapes and types of the task's options, leaves (A, ...)."""
     now = loop.belief, loop.session, jax.random.key(0)
     return jax.eval_shape(loop.task.options, *now).designs
+
+
+def _row(name: str, design: Any, table: Array) -> jax.Array:
+    """() int32: the row of ``table`` (A, e) that an index or coordinates name."""
+    try:
+        operator.index(design)
+    except TypeError:
+        at = np.atleast_1d(numbers(name, design))
+    else:
+        return _index(name, design, len(table))
+    if at.shape != table.shape[1:]:
+        raise ValueError(
+            f"{name} must be an index or have {table.shape[1]} coordinates, "
+            f"got {design!r}"
+        )
+    span = np.ptp(table, axis=0)
+    span = np.where(span > 0.0, span, np.abs(table).max() or 1.0)
+    off = (np.abs(table - at) / span).max(axis=1)
+    nearest = int(off.argmin())
+    if off[nearest] > _NEAR:
+        raise ValueError(
+            f"{name} must be a design of the task, got {in_words(at)}; the nearest is "
+            f"{nearest}, {in_words(table[nearest])}"
+        )
+    return jnp.int32(nearest)
 
 
 def _index(name: str, value: Any, count: int) -> jax.Array:

@@ -67,7 +67,7 @@ def next_measurement(
     Args:
         task: what is unknown and what may be measured.
         history: (design, outcome) of each measurement in order. A design is an index of
-            ``task.designs``, or where the task has no table its coordinates.
+            ``task.designs`` (a whole number) or its coordinates.
         decider: when not given, the largest expected gain; where time or uses count,
             what ``fit_ahead.fit`` finds for the task and this budget, in some seconds
             at the first call.

@@ -1,9 +1,9 @@
 """A closed loop for other programs: a JSON object per line, each with an answer.
 
 ``do`` is ``suggest``, ``observed`` or ``state``: see docs/adaptive.md. ``observed``
-takes the outcome of what was suggested, or with a ``design`` that of another one; with
-a ``number`` it is refused unless that measurement is the next, so a program that does
-not know whether its last line arrived sends it again.
+takes the outcome of what was suggested, or with a ``design``, an index or coordinates,
+that of another one; with a ``number`` it is refused unless that measurement is the
+next, so a program that does not know whether its last line arrived sends it again.
 """
 
 from __future__ import annotations

@@ -65,6 +65,17 @@ def test_a_proposal_is_the_largest_gain_of_the_exact_posterior(task):
     assert int(proposal.session.uses) == 1  # two of the tests tripped
 
 
+@pytest.mark.slow
+def test_coordinates_are_as_good_as_indices(task):
+    at = np.asarray(task.designs)
+    by_index = next_measurement(task, [(3, 1), (np.int64(7), 0)], seconds=30, uses=3)
+    named = [(tuple(at[3].tolist()), 1), ([1.0, 3 / 6], np.int32(0))]
+    by_name = next_measurement(task, named, seconds=30, uses=3)
+    assert tuple(at[7]) == (1.0, np.float32(3 / 6))
+    assert by_index.design == by_name.design
+    assert by_index.gain == by_name.gain
+
+
 def test_a_spent_budget_proposes_nothing(task):
     proposal = next_measurement(task, [(3, 1)], seconds=30, uses=1)
     assert proposal.design is None
@@ -77,7 +88,9 @@ def test_a_spent_budget_proposes_nothing(task):
         ((99, 0), r"history\[1\]: design must be a whole number in \[0, 10\), got 99"),
         ((-1, 0), r"history\[1\]: design must be a whole number in \[0, 10\), got -1"),
         ((True, 0), r"history\[1\]: design must"),
-        (((0.0, 0.5), 0), r"history\[1\]: design must be a whole .*got \(0.0, 0.5\)"),
+        (((0.0, 0.51), 0), r"history\[1\]: design .* nearest is 2, \(0, 0.5\)"),
+        ((0.5, 0), r"history\[1\]: design must be an index or have 2 coordinates"),
+        ((("a", 1), 0), r"history\[1\]: design must be an array of numbers"),
         ((3, 2), r"history\[1\]: outcome must be a whole number in \[0, 2\), got 2"),
         ((3, 0.5), r"history\[1\]: outcome must be a whole number"),
         ((3, True), r"history\[1\]: outcome must be a whole number"),

@@ -65,7 +65,7 @@ def test_a_session_is_that_of_the_loop(task):
         )
         assert state["number"] == 1 and state["seconds"] is None and not state["over"]
         other, then = asked(
-            loop, {"do": "observed", "outcome": 0, "design": 0}, {"do": "suggest"}
+            loop, {"do": "observed", "outcome": 0, "design": [0.125]}, {"do": "suggest"}
         )
         assert other == {"number": 2} and then["number"] == 2
         assert [int(design) for design, _ in loop.history] == [3, 0]
