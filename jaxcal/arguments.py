@@ -285,13 +285,14 @@ def exit_code(
     command: Callable[[], int | None], program: str, interrupted: str = ""
 ) -> int:
     """Run a command: what it returns or 0; 2 where something given is bad, 130 where it
-    is interrupted; ``interrupted`` says what was kept."""
+    is interrupted, 143 where terminated; ``interrupted`` says what was kept."""
     try:
         return command() or 0
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        how = str(stop) or "interrupted"
         more = f", {interrupted}" if interrupted else ""
-        print(f"{program}: interrupted{more}", file=sys.stderr)
-        return 130
+        print(f"{program}: {how}{more}", file=sys.stderr)
+        return 143 if how == "terminated" else 130
     except BrokenPipeError:  # the reader of a pipe, such as head, has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

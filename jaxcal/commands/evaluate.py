@@ -8,10 +8,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from jaxcal.arguments import Parser, exit_code, several, told, typed_line, values_of
 from jaxcal.extras import needs
@@ -172,7 +173,11 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
         with told():
             made.function(options)
 
-    return exit_code(run, prog, "nothing was written")
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        return exit_code(run, prog, "nothing was written")
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def parser(prog: str, typed: str, of_task: bool = False) -> Parser:
@@ -196,6 +201,11 @@ def parser(prog: str, typed: str, of_task: bool = False) -> Parser:
 
 def _listed(abouts: Mapping[str, str]) -> str:
     return "\n".join(f"  {name:10} {about}" for name, about in abouts.items())
+
+
+def _terminate(number: int, frame: object) -> NoReturn:
+    """SIGTERM ends the command as Ctrl-C does."""
+    raise KeyboardInterrupt("terminated")
 
 
 def _run(options: EvaluateOptions) -> None:

@@ -157,7 +157,7 @@ def test_the_report_is_one_page_and_figures(
 
 def test_baselines_load_no_jax() -> None:
     script = (
-        "import sys; sys.argv = ['evaluate.py']; import evaluate\n"
+        "import sys; sys.argv = ['evaluate.py']; from evaluate import evaluate\n"
         "code = evaluate.main(['--episodes', '3', '--methods', 'greedy,exact'])\n"
         "bad = [m for m in ('jax', 'flax', 'brax', 'mujoco', 'matplotlib') "
         "if m in sys.modules]\n"
@@ -272,20 +272,27 @@ def test_dataset0_says_how_it_is_made(capsys: pytest.CaptureFixture[str]) -> Non
     assert "python -m benchmarks.paper.datasets dataset0 --out DIR" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("number", "code", "says"),
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")],
+)
 def test_a_stopped_command_writes_nothing(
     tmp_path: pathlib.Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
+    number: int,
+    code: int,
+    says: str,
 ) -> None:
     def stop(_: object, task: str, done: int, total: int) -> None:
         if done:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
 
     monkeypatch.setattr(Progress, "__call__", stop)
     out = tmp_path / "o.json"
     done = call(capsys, "--episodes", 3, "--methods", "greedy", "--json", out)
-    assert done.returncode == 130 and done.stdout == ""
-    assert done.stderr == "evaluate.py: interrupted, nothing was written\n"
+    assert done.returncode == code and done.stdout == ""
+    assert done.stderr == f"evaluate.py: {says}, nothing was written\n"
     assert list(tmp_path.iterdir()) == []
 
 
