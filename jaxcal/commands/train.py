@@ -69,13 +69,17 @@ def _run(arguments: TrainOptions, prog: str) -> int:
     made_by = of_task if arguments.task else of_postures
     configure: Any = functools.partial(made_by, arguments, out)
     jax, config = sys.modules.get("jax"), None
+    seeds = arguments.values.get("num_seeds") or 1
     with needs("policy", "training"):
+        if arguments.task and seeds > 1:  # before a rule of the task is tuned
+            from jaxcal.learning.runtime import devices
+
+            devices.a_device_for_each_core(seeds)
         if jax is None or not jax.distributed.is_initialized():
             config = configure()  # what is wrong is said before JAX is loaded
         from jaxcal.learning.runtime import devices
 
-    seeds = arguments.values.get("num_seeds") or getattr(config, "num_seeds", None)
-    if seeds and seeds > 1:
+    if (seeds := getattr(config, "num_seeds", seeds)) > 1:
         devices.a_device_for_each_core(seeds)
     config = devices.on_first(configure) if config is None else config
     with _stop_on_signals() as stop:
