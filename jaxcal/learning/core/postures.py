@@ -108,7 +108,7 @@ class Postures:
     task: Episode
     network: Network
 
-    def init(self, key: jax.Array) -> Any:
+    def init(self, key: jax.Array, *given: Any) -> Any:
         """Parameters before training."""
         m, n = jax.eval_shape(self.task.reset, key).candidates.shape
         return initial(self.network, key, m, n, self.task.num_decisions)
@@ -117,7 +117,7 @@ class Postures:
         """This learner with another configuration."""
         return dataclasses.replace(self, config=config)
 
-    def begin(self, keys: jax.Array) -> jax.Array:
+    def begin(self, keys: jax.Array, *given: Any) -> jax.Array:
         """(B, 2) uint32, data of the keys of the rows, of which (B,) are the first."""
         return jax.random.key_data(keys)
 
