@@ -567,6 +567,8 @@ def test_two_pools_differ_where_their_digest_is_not_given(rng):
     sets = [np.asarray(drawn(task, jax.random.key(0))) for task in tasks]
     for pool, found in zip((one, two), sets, strict=True):
         assert {*map(tuple, found)} <= {*map(tuple, pool.values[0])}
+    with pytest.raises(ValueError, match="values or sha256, got neither"):
+        GivenCandidates("mine")
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -36,6 +36,8 @@ class GivenCandidates:
                     digest.update(f"{array.dtype.str} {array.shape}\n".encode())
                     digest.update(np.ascontiguousarray(array).tobytes())
             object.__setattr__(self, "sha256", digest.hexdigest())
+        elif not self.sha256:
+            raise ValueError("give the candidates: values or sha256, got neither")
 
     def source(self, config: SelectionConfig) -> CandidateSource:
         if self.values is None:
