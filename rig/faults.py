@@ -43,6 +43,16 @@ class TurnedTooFar(MotionFault):
     """A move turned the phone further than was proved of it."""
 
 
+class EndedShort(MotionFault):
+    """A drive reports its move done but stands short of the target: it was stopped from
+    outside, or reached a limit of its own."""
+
+    def __init__(self, text: str, axis: str, pulses: int) -> None:
+        self.axis = axis
+        self.pulses = pulses  # where it stands
+        super().__init__(text)
+
+
 class Unreachable(RuntimeError):
     """The device is sound but cannot get there: leave this posture out."""
 

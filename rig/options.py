@@ -32,6 +32,8 @@ class Simulation:
     ] = "tcp"
     noise: Annotated[float, "degrees", (0, 90)] = 0.02
     backlash: Annotated[float, "degrees", (0, 90)] = 0.0
+    dead_zone: Annotated[float, "degrees", (0, 90)] = 0.0
+    breakaway: Annotated[float, "degrees before a joint at rest moves", (0, 90)] = 0.0
     drift: Annotated[float, "degrees per minute", (-90, 90)] = 0.0
     speedup: Annotated[float, "factor on the speed of the axes", (0.01, 100)] = 1.0
     rate: Annotated[float, "of the phone, Hz", (0.1, 1000)] = 100.0
@@ -39,6 +41,9 @@ class Simulation:
     swapped: (
         Annotated[list[str], "A,B: two drives with swapped cables", _axes] | None
     ) = None
+    gearing: Annotated[int, "pulses per turn that the drives are set to"] | None = None
+    lost_origin: Annotated[float, "offset of the counts, deg", (-90, 90)] = 0.0
+    realistic: Annotated[bool, "slow replies and enabling, jitter, watchdog"] = False
 
 
 SIMULATOR = {field.name for field in dataclasses.fields(Simulation)} | {"fault"}

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import sys
 import time
 from typing import Annotated, Literal
@@ -38,6 +39,7 @@ def setup(
 ) -> int:
     """from cables to a device that may be calibrated; writes rig.toml"""
     from rig.journal.device import DeviceRecord
+    from rig.journal.run_folder import new_run_folder
     from rig.prove import steps
     from rig_workbench.commission import setup as wizard
 
@@ -47,15 +49,29 @@ def setup(
         bus=bus, imu=imu, units=units, values=values, home=home, axes=axes,
         drives=drives, readings=readings, model=urdf,
     )  # fmt: skip
-    if given.simulate:
+    if given.simulate and (axes or drives or readings or urdf):
         raise Refused(
-            "setup writes the file of a device. To practise, type `jaxcal-rig "
-            "simulate` in another terminal, and leave out --simulate here"
+            "--simulate commissions the simulated device: leave out --axes, --drives, "
+            "--readings and --urdf"
         )
-    config = wizard.begin(path, asked, operator)
-    record = DeviceRecord.load(config.device_path)
-    site = steps.Site(config, record, operator, path, reset_alarms=given.reset_alarms)
-    return wizard.go(site, asked)
+    with contextlib.ExitStack() as stack:
+        if given.simulate:
+            device = dataclasses.replace(given, config=None)
+            simulator = stack.enter_context(device.simulator(device.load()))
+            asked = wizard.simulated(simulator, asked)
+            output = Path(simulator.config.output)
+            path = given.config or new_run_folder(output, "simulated") / "rig.toml"
+            if path.exists():  # its bus may be that of a real device
+                raise Refused(
+                    f"{path} exists: --simulate writes a new file. Name a new file, or "
+                    "leave out --config or --simulate"
+                )
+        config = wizard.begin(path, asked, operator)
+        site = steps.Site(
+            config, DeviceRecord.load(config.device_path), operator, path,
+            reset_alarms=given.reset_alarms, full_speed=given.simulate,
+        )  # fmt: skip
+        return wizard.go(site, asked)
 
 
 def imu(

@@ -110,6 +110,7 @@ class Device:
         self.proof = Proof(config.axes, self.geometry, checked, run.simulated, gains)
         self.proof.stops = stop_distances(self.record, config.axes)
         self.shown = False  # each axis has turned the phone as `axes` saw it
+        self.last_move: tuple[str, Pulses, Pulses] | None = None  # label, from, to
         self.rest: Pulses | None = None  # where it arrived,
         self.targets: list[int | None] = []  # and the drives' target registers then
         self.armed = self.pausing = False

@@ -11,7 +11,7 @@ from rig.config.axis import Axis, Pulses
 from rig.core.device import Device, Posture, approach, check_plan
 from rig.drives.drive import START_S, STILL_COUNTS, Drive, Status
 from rig.drives.line import BusError
-from rig.faults import MotionFault, Unreachable
+from rig.faults import EndedShort, MotionFault, Unreachable
 from rig.readings.attitude import Array
 
 DEADLINE_FACTOR, DEADLINE_SLACK_S = 2.0, 2.0  # of a move's computed time, and more
@@ -34,7 +34,8 @@ def move(device: Device, posture: Posture) -> Arrival:
     """Move all axes to a posture, in pieces, from the chosen side.
 
     LimitError: outside the limits, nothing was sent. Unreachable: a drive refused the
-    target. MotionFault, BusError, ReadingError, StopRequested: stop everything.
+    target. EndedShort: one ended short of it. MotionFault, BusError, ReadingError,
+    StopRequested: stop everything.
     """
     if not device.armed:
         raise MotionFault("not armed")
@@ -63,6 +64,8 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
     for index, drive in enumerate(device.drives):
         drive.axis = proof.paced(index, end[index] - here[index], end[index])
     device.untrack()  # until it arrives
+    if end != here:
+        device.last_move = label, here, end
     device.heartbeat.feed(moving=True)
     try:
         for index, (drive, pulses) in enumerate(zip(device.drives, end, strict=True)):
@@ -213,12 +216,13 @@ def _stalled(
     end, angle = map(axis.to_deg, (goal, status.position))
     short_by = abs(end - angle)
     if status.done and not status.moving and moved:
-        return MotionFault(
+        return EndedShort(
             f"{axis.name} stopped {short_by:.3f} {axis.unit_name} short of its "
             f"target, at {angle:.3f}, and its drive reports the move as done. Find "
             "out what stopped it: another controller, an emergency stop that was "
-            "released, or a limit of the drive that session.*_range_deg must not reach"
-        )
+            "released, or a limit of the drive",
+            axis.name, status.position,
+        )  # fmt: skip
     return MotionFault(
         f"{axis.name} does not follow: it has been {short_by:.3f} {axis.unit_name} "
         f"from its target for {stood_s:.2f} s (limit motion.stall_s = {stall_s:g}). "

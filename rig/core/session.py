@@ -20,16 +20,25 @@ from rig.core.measure import measure, zeroed
 from rig.core.motion import Arrival, move
 from rig.core.proof import Turns, slopes
 from rig.core.record_check import ZeroRecord
-from rig.faults import MotionFault, NotFollowing, TurnedTooFar, Unreachable, ending
+from rig.faults import (
+    EndedShort,
+    MotionFault,
+    NotFollowing,
+    TurnedTooFar,
+    Unreachable,
+    ending,
+)
 from rig.journal.device import SIGN_CHECKED, ZEROED
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import Record
 from rig.readings.attitude import Array, angle_between_deg
 from rig.readings.geometry import Attitudes
+from rig.readings.source import ReadingError
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 LEAST_TURN_DEG = 0.05  # of the phone's heading: less is its noise
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
+SAME_PLACE_DEG = 0.5  # two places where an axis ended short of one target
 SHOWN_DEG = 3.0  # that each axis is moved, from a third of it to the whole
 RATIO = (2 / 3, 4 / 3)  # of what `axes` saw
 ASIDE_DEG = 4.0  # between the axes of two turns, and ...
@@ -78,6 +87,32 @@ def open_device(run: SessionRun) -> Iterator[Device]:
                     lock.stood(forget=gone)
                 if reason and not all(r.standing for r in device.stopper.stay()):
                     lock.leave(config)
+                if reason and device.last_move:
+                    device.emit("last_move", **_last_move(device))
+
+
+def _last_move(device: Device) -> Record:
+    """What moved last, from where to where, and where drives and phone are now."""
+    assert device.last_move is not None
+    config, (label, start, end) = device.config, device.last_move
+    stands = [result.position for result in device.stopper.results]
+    phone = None
+    with contextlib.suppress(ReadingError):
+        if device.oriented and device.frame:
+            phone = device.frame.angles(device.imu.latest().value).round(3).tolist()
+    return {
+        "label": label,
+        "axes": list(config.axis_names),
+        "units": [axis.unit_name for axis in config.axes],
+        "outputs": list(config.output_names),
+        "from_deg": config.to_deg(start).round(3).tolist(),
+        "to_deg": config.to_deg(end).round(3).tolist(),
+        "drives_deg": [
+            None if at is None else round(axis.to_deg(at), 3)
+            for axis, at in zip(config.axes, stands, strict=True)
+        ],
+        "phone_deg": phone,
+    }
 
 
 def _close(device: Device) -> None:
@@ -221,6 +256,14 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
         if names := [n for n, r in run.postures().items() if r["seq"] > since]:
             run.emit("void", sync=True, names=names)
         raise
+    except EndedShort as fault:
+        ended = {"name": name, "axis": fault.axis, "pulses": fault.pulses}
+        twice = _ended_there(device, ended)
+        device.emit("ended_short", sync=True, **ended)
+        if not twice:  # going on is typed
+            raise
+        _leave_out(device, name, f"{fault}. It ended there before")
+        return None
     except Unreachable as reason:
         _leave_out(device, name, str(reason))
         return None
@@ -228,6 +271,17 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
     record = device.emit("posture", sync=True, name=name, **measurement, **fields)
     device.requests.check_pause()
     return record
+
+
+def _ended_there(device: Device, ended: Record) -> bool:
+    """Whether this axis ended short at this place before, on the way to a posture."""
+    axis = next(axis for axis in device.config.axes if axis.name == ended["axis"])
+    near, same = axis.pulses_within(SAME_PLACE_DEG), (ended["name"], ended["axis"])
+    return any(
+        (record["name"], record["axis"]) == same
+        and abs(record["pulses"] - ended["pulses"]) <= near
+        for record in device.run.journal.events("ended_short")
+    )
 
 
 def _leave_out(device: Device, name: str, reason: str) -> None:

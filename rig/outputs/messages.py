@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.extras import MissingExtraError
+from rig.config import AXIS_NAMES
 from rig.core.stop import UnitStop
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE
 from rig.journal.run_folder import Record, RunFolder
@@ -43,6 +44,26 @@ def _stayed(record: Record) -> str:
     lines = [f"WARNING: {text}, and was stopped again" for text in record["went_on"]]
     units = [f"  {UnitStop(**unit)}" for unit in record["units"]]
     return "\n".join([*lines, *units])
+
+
+def _last_move(record: Record) -> str:
+    """What moved last, from where to where, and what drives and phone say now."""
+    ways = []
+    # Written before axes had names of their own: those of the first device.
+    names = record.get("axes", AXIS_NAMES)
+    units = record.get("units", ["deg"] * len(names))
+    outputs, values = record.get("outputs") or names, record["phone_deg"] or ()
+    measured = dict(zip(outputs, values, strict=False))
+    for i, name in enumerate(names):
+        begin, end = record["from_deg"][i], record["to_deg"][i]
+        if begin != end:
+            drive = record["drives_deg"][i]
+            place = "its drive does not answer" if drive is None else f"now {drive:.2f}"
+            place += f", measured {measured[name]:.2f}" if name in measured else ""
+            ways.append(f"{name} from {begin:.2f} to {end:.2f} {units[i]} ({place})")
+    others = [f"{name} {at:.3g}" for name, at in measured.items() if name not in names]
+    told = f"; measured {', '.join(others)}" if others else ""
+    return f"last moved to {record['label']}: {'; '.join(ways) or 'no axis'}{told}"
 
 
 def _stop(record: Record) -> str:
@@ -83,6 +104,7 @@ SENTENCES: dict[str, str | Callable[[Record], str]] = {
     "comm_restored": _comm_restored,
     "stop": _stop,
     "stayed": _stayed,
+    "last_move": _last_move,
     "shown": "  {axis}: measured/commanded {ratio:.3f}, at `axes` {before:.3f}",
 }
 

@@ -68,6 +68,7 @@ class RunState:
     candidates: list[Degrees] = dataclasses.field(default_factory=list)
     drift: list[tuple[float, Degrees]] = dataclasses.field(default_factory=list)
     stop: Record | None = None
+    last_move: Record | None = None  # at a fault: from where to where, and what is seen
     ended: Record | None = None
     warnings: list[str] = dataclasses.field(default_factory=list)
     log: list[tuple[float, str]] = dataclasses.field(default_factory=list)
@@ -91,7 +92,7 @@ class RunState:
                 self.start = record if event == "start" else self.start
                 self.pid, self.host = record.get("pid"), record.get("host", "")
                 self._interrupt()
-                self.ended = self.stop = None
+                self.ended = self.stop = self.last_move = None
                 self.phase, self.pausing, self.warnings = "opening", False, []
             case "plan" | "replan":
                 self._plan(record)
@@ -134,6 +135,8 @@ class RunState:
                 self.stop = record
             case "stayed" if self.stop:
                 self.stop = self.stop | {"units": record["units"]}
+            case "last_move":
+                self.last_move = record
             case "sender_refused" | "comm_restored":
                 self.warnings += [line.strip() for line in event_lines(record)]
             case _ if event in ENDS:

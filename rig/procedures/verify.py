@@ -21,6 +21,7 @@ from rig.parts import model_of
 from rig.procedures.calibrate import pair_targets, visit_pairs
 from rig.procedures.plan import draw_held_out
 from rig.readings.attitude import Array
+from rig.readings.geometry import Frame, geometry_of
 
 
 def load_calibration(
@@ -122,6 +123,14 @@ def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
     if run.lacks(["goto"]):
         with run.device() as device:
             visit(device, Posture("goto", pulses), role="goto")
+            counted = [drive.axis.name for drive in device.drives if drive.origin]
+            names = unchecked(config, device.frame, counted)
+        if names:
+            run.say(
+                f"NOT CHECKED: whether {', '.join(names)} was moved while without "
+                "power. The drive does not report it, and a phone cannot measure "
+                "rotation about the vertical. If in doubt: jaxcal-rig setup home"
+            )
     record = run.postures().get("goto")
     if record is None:
         return EXIT_RECALIBRATE
@@ -149,3 +158,18 @@ def _command(config: RigConfig, calibration: Any, desired: Array) -> Array:
         matrix = np.asarray(calibration.matrix)
         return np.linalg.lstsq(matrix, desired - calibration.bias)[0]
     return np.asarray(calibration.command_for(desired), dtype=np.float64)
+
+
+def unchecked(
+    config: RigConfig, frame: Frame | None, told: Sequence[str] = ()
+) -> list[str]:
+    """Axes of which neither drive nor phone tells that they were moved when off.
+
+    A drive without homed bit and absolute encoder counts from 0 when it is switched on,
+    but for ``told`` axes, whose home is at a count of its own.
+    """
+    unseen = [] if frame is None else geometry_of(config).unseen(frame.zero)
+    telling = [a.name for a in config.axes if a.map.has("homed")]
+    telling += [a.name for a in config.axes if a.map.absolute_encoder]
+    names = [name for name in config.axis_names if name in unseen]
+    return [name for name in names if name not in (*telling, *told)]

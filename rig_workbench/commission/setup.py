@@ -33,7 +33,7 @@ from rig_workbench.model import joint_names
 from rig_workbench.outputs import template
 
 if TYPE_CHECKING:
-    pass
+    from rig.parts import SimulatedDevice
 
 FORMATS = ["hyperimu", "sensorlogger", "sensorlog", "json", "lines"]
 SAFETY = (
@@ -125,6 +125,25 @@ def setting(text: str) -> tuple[str, Any]:
         return key, tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
         return key, value
+
+
+def simulated(simulator: SimulatedDevice, options: SetupOptions) -> SetupOptions:
+    """What an operator would answer of a simulated device, and its phone started."""
+    bus = simulator.start().bus
+    where = f"{bus.transport}:{bus.host}:{bus.port}"
+    if bus.transport == "rtu":
+        where = f"rtu:{bus.device},{bus.baudrate},N,8,1"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    simulator.start_phone(port)
+    imu = simulator.config.phone
+    values: dict[str, Any] = {"imu.host": "127.0.0.1", "imu.stale_s": imu.stale_s}
+    for axis in simulator.config.axes:
+        for name in ("reduction", "speed_deg_s", "accel_deg_s2"):
+            values[f"axes.{axis.name}.{name}"] = getattr(axis, name)
+    return dataclasses.replace(
+        options, bus=where, imu=f"{imu.format}:{port}", values=values | options.values
+    )
 
 
 def begin(path: pathlib.Path, options: SetupOptions, operator: Operator) -> RigConfig:

@@ -8,7 +8,7 @@ from typing import Any
 
 from rig.core.stop import UnitStop
 from rig.faults import EXIT_RECALIBRATE
-from rig.outputs.messages import error_text, summary_lines
+from rig.outputs.messages import error_text, event_lines, summary_lines
 from rig.outputs.run_state import ACTIVE, SESSIONS, PostureState, Record, RunState
 from rig.parts import PLACES
 
@@ -83,7 +83,9 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
         ]
     elif ended is not None and ended["event"] != "end":
         units = stop["units"] if stop else []
-        lines += [ended.get("reason", ""), *(str(UnitStop(**u)) for u in units)]
+        moved = event_lines(state.last_move) if state.last_move else []
+        lines += [ended.get("reason", ""), *moved]
+        lines += [str(UnitStop(**u)) for u in units]
         lines += [go_on] if ended["event"] != "refused" else []
     elif ended is None and stop is not None and stop["reason"]:
         lines.append(f"Stopped: {stop['reason']}")

@@ -88,6 +88,15 @@ class Truth:
         return np.where(self.reversed, -1.0, 1.0)
 
 
+REALISTIC: dict[str, Any] = {
+    "latency_s": 0.004,
+    "enable_delay_s": 0.5,
+    "reset_delay_s": 0.3,
+    "jitter_counts": 1,
+    "idle_watchdog": True,
+}
+
+
 def truth_of(options: dict[str, Any], config: RigConfig) -> Truth:
     """The simulated device that the options of a command line describe; ValueError
     where ``swapped`` or ``reversed`` names no axes of it."""
@@ -102,13 +111,16 @@ def truth_of(options: dict[str, Any], config: RigConfig) -> Truth:
             raise ValueError(f"--swapped must name two axes, got {','.join(swapped)}")
         a, b = map(list(names).index, swapped)
         order[a], order[b] = b, a
-    turned = options["reversed"] or ()
+    degrees = ("noise", "backlash", "breakaway", "dead_zone")
+    pulses, turned = options["gearing"], options["reversed"] or ()
     return Truth.of(
         config,
         drift_deg_per_min=options["drift"],
         seed=config.session.seed,
         reversed=tuple(name in turned for name in names),
         swapped=tuple(order),
-        noise_deg=options["noise"],
-        backlash_deg=options["backlash"],
+        drive_pulses_per_rev=pulses and (pulses,) * len(names),
+        lost_origin_deg=(options["lost_origin"],) * len(names),
+        **{f"{name}_deg": options[name] for name in degrees},
+        **(REALISTIC if options["realistic"] else {}),
     )

@@ -372,6 +372,16 @@ def test_a_count_that_jumps_is_no_speed(counts, fast, monkeypatch):
         moving._check_speed(device, axis, seen)
 
 
+def test_what_moved_last_is_no_move_of_no_way():
+    with bench() as motion:
+        here = motion.device.positions()
+        motion.move_to(here, "reference")
+        assert motion.device.last_move is None
+        motion.move_to((here[0] + 100, *here[1:]), "x")
+        motion.move_to(motion.device.positions(), "reference")
+        assert motion.device.last_move[0] == "x"
+
+
 def test_a_missed_deadline_stops(monkeypatch):
     monkeypatch.setattr(moving, "DEADLINE_SLACK_S", 0.05)
     with bench(speedup=0.05) as motion:

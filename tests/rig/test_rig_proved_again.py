@@ -129,6 +129,7 @@ def test_a_session_whose_drives_were_halted_does_not_move_again(
             else ["short of its target", "does not follow"]
         )
         assert any(reason in said for reason in reasons), said
+        assert "last moved" in said
         run = run_folder(at)
         recorded = len(postures(run))
         sim.faults.clear()
@@ -142,6 +143,36 @@ def run_folder(at):
 
 def postures(run):
     return [r for r in read_journal(run / "journal.jsonl") if r["event"] == "posture"]
+
+
+@pytest.mark.slow
+def test_a_place_where_an_axis_ends_twice_is_out_of_reach(at, capsys):
+    """An obstacle in one posture, and the drive says nothing; going on is typed."""
+    with proved(at, capsys) as sim:
+        roll = sim.drives[2]
+
+        @functools.cache
+        def furthest():
+            """Pulses of roll in the planned posture that is furthest."""
+            records = read_journal(run_folder(at) / "journal.jsonl")
+            plan = next(record for record in records if record["event"] == "plan")
+            return max(plan["candidates"][i][2] for i in plan["choice"]["indices"])
+
+        def start(begin=roll._start):
+            begin()
+            if roll.target == furthest():
+                roll.target -= round(2.0 * roll.pulses_per_deg)
+
+        roll._start = start
+        code, said = session(capsys)
+        assert code == 3 and "roll stopped" in said, said
+        assert "It ended there before" not in said
+        before, run = moves(sim), run_folder(at)
+        code, said = main(["resume", str(run), "--arm"]), capsys.readouterr().out
+        assert moves(sim) > before
+        assert code in (0, 1) and "It ended there before" in said, said
+    measured = [record["pulses"][2] for record in postures(run)]
+    assert furthest() not in measured and len(measured) >= 4
 
 
 def real_limits(monkeypatch):

@@ -9,7 +9,7 @@ import types
 
 import numpy as np
 import pytest
-from commission import QUICK, device, set_up
+from commission import QUICK, device, quick_text, set_up
 from harness import ARM, fast_text, no_figures
 from other_drives import stage_text
 
@@ -205,6 +205,20 @@ def test_the_next_command_of_a_simulated_device_simulates_it(
     assert told[-1] == f"next: jaxcal-rig calibrate{again} --config rig.toml"
 
 
+@pytest.mark.slow
+def test_setup_of_a_simulated_device_in_one_command(at):
+    wrong = ["--reversed", "yaw", "--noise", "0.005"]
+    quick = [word for value in QUICK for word in ("--set", value)]
+    common = ["--simulate", "--yes", "--units", "3"]
+    assert main(["setup", *common, *wrong, *quick]) == 0
+    (path,) = at.glob("runs/simulated-*/rig.toml")
+    yaw = load_config(path).axes[1]
+    with no_figures():
+        assert main(["calibrate", "--simulate", "--config", str(path)]) == 0
+    assert yaw.direction == 1  # the simulator's own has -1
+    assert DeviceRecord.load(path.with_name("device.json")).state(ZEROED)
+
+
 def test_without_a_terminal_nothing_is_confirmed(at, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin", open(os.devnull))
     with device() as (_, bus, port):
@@ -213,10 +227,14 @@ def test_without_a_terminal_nothing_is_confirmed(at, monkeypatch, capsys):
     assert not pathlib.Path("rig.toml").exists()
 
 
-def test_a_simulated_device_is_set_up_over_its_line(at, capsys):
-    (at / "rig.toml").write_text(fast_text())
-    assert main(["setup", "--simulate", "--yes", "--config", "rig.toml"]) == 2
-    assert "`jaxcal-rig simulate` in another terminal" in capsys.readouterr().err
+def test_a_simulated_setup_leaves_the_device_of_an_existing_file_alone(at, capsys):
+    """It used the file: the real device moved, at the speed of a simulated one."""
+    with device() as (sim, bus, port):
+        (at / "rig.toml").write_text(quick_text(bus, port))
+        given = ["setup", "--simulate", "--yes", "--config", "rig.toml"]
+        assert main(given) == 2
+        assert "--simulate writes a new file" in capsys.readouterr().err
+        assert sim.server.requests == 0
 
 
 @pytest.mark.slow

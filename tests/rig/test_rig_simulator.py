@@ -148,9 +148,15 @@ def test_options_of_the_command_line_describe_a_device():
     args = make_parser().parse_args(["simulate", "--noise", "0"])
     plain = vars(args)
     assert truth_of(plain, fast_config()) == Truth(noise_deg=0.0)
-    odd = {"reversed": ["roll"], "swapped": ["pitch", "yaw"]}
+    odd = {
+        "reversed": ["roll"], "swapped": ["pitch", "yaw"], "gearing": 4000,
+        "lost_origin": 1.4, "realistic": True,
+    }  # fmt: skip
     truth = truth_of(plain | odd, fast_config())
     assert truth.reversed == (False, False, True) and truth.swapped == (1, 0, 2)
+    assert truth.drive_pulses_per_rev == (4000,) * 3
+    assert truth.lost_origin_deg == (1.4,) * 3
+    assert truth.jitter_counts == 1 and truth.idle_watchdog and truth.enable_delay_s
     with pytest.raises(ValueError, match="swapped must name two axes"):
         truth_of(plain | {"swapped": ["yaw"]}, fast_config())
 

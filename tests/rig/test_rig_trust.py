@@ -39,8 +39,8 @@ from rig.journal.device import (
 )
 from rig.journal.run_folder import read_journal
 from rig.procedures.calibrate import collect
-from rig.procedures.verify import load_calibration, verify
-from rig.readings.attitude import euler_to_matrix
+from rig.procedures.verify import load_calibration, unchecked, verify
+from rig.readings.attitude import euler_to_matrix, frame_at
 from rig.readings.geometry import geometry_of
 from rig.readings.phone import Imu
 from rig_workbench.simulator import Truth
@@ -536,3 +536,10 @@ def test_a_position_not_read_after_a_session_voids_home(bit, tmp_path):
             served
         )
         assert sim.executions() == [[], [], []]
+
+
+def test_goto_names_what_neither_drive_nor_phone_can_tell():
+    plain = fast_config({'map = "leadshine_pr"': 'map = "generic"'})
+    frame = frame_at(plain, np.eye(3))
+    assert unchecked(plain, frame) == ["yaw"]
+    assert unchecked(fast_config(), frame_at(fast_config(), np.eye(3))) == []
