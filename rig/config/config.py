@@ -30,6 +30,7 @@ UP = ("up_x", "up_y", "up_z")  # what a phone on an arm measures
 MEASURED = {
     "settle": ("window_s", "min_samples", "std_deg", "slope_deg_s", "samples"),
     "motion": ("approach_overshoot_deg",),
+    "session": ("k", "candidates", "method", "seed", "verify_postures"),
 }
 
 
@@ -254,9 +255,10 @@ class RigConfig(Section):
         """Keys that would make a resumed run measure otherwise, in words; ``start`` is
         the first record of its journal."""
         then, now = dict(start["device"]), self.device_fingerprint()
+        described = self.described()
         for table, names in MEASURED.items():
             for name in names:
-                now[f"{table}.{name}"] = getattr(getattr(self, table), name)
+                now[f"{table}.{name}"] = described[table][name]
                 then[f"{table}.{name}"] = start["config"][table][name]
         return differences(then, now)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from rig.config.settings import ImuSettings
 from rig.readings.attitude import Array, Reading
-from rig.readings.source import Source, listener_of
+from rig.readings.source import BACKLOG, Source, listener_of
 from rig.readings.stream import MAX_BODY, LineSplitter, StreamParser
 
 RECONNECT_S = 0.2
@@ -166,6 +166,7 @@ class Imu(Source):
 
     async def _accept(self, listener: Any) -> None:
         loop, tasks = asyncio.get_running_loop(), set[asyncio.Task[None]]()
+        leaving: list[socket.socket] = []
         with listener:
             while True:
                 try:
@@ -180,7 +181,8 @@ class Imu(Source):
                 else:  # it is still sending: closed at once, it would not see why
                     with contextlib.suppress(OSError):
                         made.send(_answer(403, False))
-                    loop.call_later(LOOK_S, made.close)
+                    leaving = [*(c for c in leaving if c.fileno() >= 0), made]
+                    loop.call_later(LOOK_S * (len(leaving) < BACKLOG), made.close)
 
     async def _hear(self, address: str, **how: Any) -> None:
         """Take what one connection sends, until it ends or says nothing."""

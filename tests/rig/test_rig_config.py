@@ -135,6 +135,7 @@ def test_a_run_is_resumed_with_other_addresses_and_limits_and_nothing_else():
         ("reduction = 10", "reduction = 11", "axes.pitch.reduction: was 10.0"),
         ('order = "ZXY"', 'order = "ZYX"', "mechanism.order: was ZXY, is ZYX"),
         ("samples = 25", "samples = 26", "settle.samples: was 25, is 26"),
+        ("[settle]", "[session]\nk = 6\n[settle]", "session.k: was 4, is 6"),
         (
             'map = "leadshine_pr"',
             'map = "generic"',
