@@ -353,7 +353,7 @@ def test_a_loop_that_does_not_answer_to_a_stop_is_not_waited_for():
         signals.armed = True
         device, hangs = motion.device, threading.Event()
         motion.device.line._tell = lambda event, **fields: hangs.wait(10)
-        device.stopper._emit = lambda event, **fields: hangs.wait(10)
+        device.stopper.emit = lambda event, **fields: hangs.wait(10)
         signals.request_stop("SIGTERM", 143)  # as the second thread would
         end = time.monotonic() + 3.0
         while not all(drive.stops for drive in motion.sim.drives):
