@@ -26,7 +26,7 @@ AxisName = Annotated[str, "of rig.toml"]
 WIDE = (-1e6, 1e6)
 RunPath = Annotated[Path, "the run's folder"]
 Saved = Annotated[Path, "rig.toml, or a run's folder"]
-Postures = Annotated[int, "postures", (1, 1_000_000)]
+Postures = Annotated[int, "postures"]
 Programs = Annotated[list[str], "programs named in the file that may be run"]
 Units = Annotated[int, "scan unit ids 1 to N", (1, 247)]
 BusName = Annotated[
@@ -183,6 +183,8 @@ def _session(
     """Run a new session; returns the exit code."""
     from rig.sessions import run_session
 
+    if count is not None and count < 1:
+        raise Refused(f"--count must be at least 1, got {count}")
     saved = None if calibration is None else str(calibration.resolve())
     config = given.load()
     start = {
