@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import (
     Array,
@@ -274,20 +274,25 @@ class FromFunction(Model):
     def _by_parameters(self, rows: Array, theta: Array) -> Array:
         steps = self._steps_for("parameters", rows, theta)
 
-        def jobs(j: int, side: str) -> list[Any]:
+        def jobs(at: Array, j: int, side: str) -> list[Any]:
             offsets = STENCILS[side].offsets * steps.steps[j]
             moved = theta + offsets[:, None] * np.eye(len(theta))[j]
-            return [(rows, point) for point in moved]
+            return [(at, point) for point in moved]
 
-        every = [job for j, side in enumerate(steps.sides) for job in jobs(j, side)]
-        values, sides = self._run(every), [*steps.sides]
+        pairs = enumerate(steps.sides)
+        values = self._run([job for j, side in pairs for job in jobs(rows, j, side)])
+        sides = np.array([steps.sides] * len(rows), dtype=object).T
         if np.isnan(np.array(values)).any():  # at an edge of what f takes?
             answered = ~np.isnan(self.predict(rows, theta)).any(axis=1)
             for j in range(len(theta)):
-                its = slice(4 * j, 4 * j + 4)
+                its = values[4 * j : 4 * j + 4]
                 for side in ("forward", "backward"):
-                    if np.isnan(np.array(values[its])[:, answered]).any():
-                        values[its], sides[j] = self._run(jobs(j, side)), side
+                    lost = answered & np.isnan(np.array(its)).any(axis=(0, 2))
+                    if lost.any():
+                        tried = self._run(jobs(rows[lost], j, side))
+                        for old, new in zip(its, tried, strict=True):
+                            old[lost] = new
+                        sides[j, lost] = side
         return self._slopes(steps, rows, values, sides)
 
     def _by_commands(self, rows: Array, theta: Array) -> Array:
@@ -298,23 +303,26 @@ class FromFunction(Model):
         points = rows + moves.reshape(-1, 1, rows.shape[1])
         values = self._run([(points.reshape(-1, rows.shape[1]), theta)])[0]
         values = values.reshape(len(points), len(rows), -1)
-        return self._slopes(steps, rows, [*values], steps.sides)
+        sides = np.array([steps.sides] * len(rows), dtype=object).T
+        return self._slopes(steps, rows, [*values], sides)
 
     def _slopes(
         self,
         steps: Differences,
         rows: Array,
         values: list[Array],
-        sides: Sequence[str],
+        sides: NDArray[np.object_],
     ) -> Array:
-        """(N, q, p) of 4 p values (N, q), by ``sides`` of the p."""
+        """(N, q, p) of 4 p values (N, q), by ``sides`` (p, N)."""
         slopes = np.empty((*values[0].shape, len(steps.steps)))
         rough = np.empty_like(slopes)
         for j, step in enumerate(steps.steps):
-            stencil = STENCILS[sides[j]]
-            weights = np.array([stencil.fine, stencil.coarse]) / step
             stack = np.array(values[4 * j : 4 * j + 4])
-            slopes[..., j], rough[..., j] = combined(stack, weights, self.periods)
+            for side in {*sides[j]}:
+                at, stencil = sides[j] == side, STENCILS[side]
+                weights = np.array([stencil.fine, stencil.coarse]) / step
+                fine, coarse = combined(stack[:, at], weights, self.periods)
+                slopes[at, :, j], rough[at, :, j] = fine, coarse
         with np.errstate(invalid="ignore"):
             largest = np.nanmax(np.abs(slopes), axis=0, initial=0.0)  # (q, p)
             apart = np.abs(slopes - rough)

@@ -385,6 +385,17 @@ def test_near_an_edge_the_other_side_is_taken():
     np.testing.assert_allclose(found, -U[:, 0], atol=1e-7)
 
 
+def test_each_command_is_differenced_to_the_side_that_f_takes_there():
+    def reached(u, theta):
+        if abs(u[0] - theta[0]) > 1.0:
+            raise ValueError("out of reach")
+        return (u[0] - theta[0]) ** 2
+
+    ends = np.array([[-1.0], [0.0], [1.0]])
+    found = FromFunction(reached, [0.0], [0.1]).jacobian(ends)[:, 0, 0]
+    np.testing.assert_allclose(found, [2.0, 0.0, -2.0], atol=1e-6)
+
+
 def test_a_fit_that_ends_where_f_fails_says_so():
     def walled(u, theta):
         if theta[0] < 0.5:
