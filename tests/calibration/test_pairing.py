@@ -95,6 +95,10 @@ SPOILT = {
         lambda u, y: (u[:20], y[:20] * np.where(np.arange(20) < 11, 1, 0.1)[:, None]),
         "from row 11 on the readings have another slope or offset",
     ),
+    "rows exchanged": (
+        lambda u, y: (u[:20], y[[*range(5), 14, *range(6, 14), 5, *range(15, 20)]]),
+        "the readings of rows 5, 14 are exchanged",
+    ),
     "lag": (
         lambda u, y: (u[6:26], y[:20]),
         "all readings are 6 rows late",

@@ -393,7 +393,12 @@ def _explains(plain: Fitted, fit: Fitted) -> bool:
 
 def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     """Other pairings of rows, fitted."""
-    from jaxcal.calibration.pairing.rearranged import places, polished, sorted_alone
+    from jaxcal.calibration.pairing.rearranged import (
+        exchanged,
+        places,
+        polished,
+        sorted_alone,
+    )
     from jaxcal.calibration.pairing.search import ranked
 
     tables = [table]
@@ -413,7 +418,7 @@ def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     for path in top(paths, 2):
         with contextlib.suppress(ValueError):
             fits.append(polished(table, path)[0])
-    for search in (_apart, sorted_alone):
+    for search in (_apart, exchanged, sorted_alone):
         with contextlib.suppress(ValueError):
             fits += search(table, plain)
     return fits

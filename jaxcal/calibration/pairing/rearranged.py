@@ -270,6 +270,20 @@ def assigned(table: Table, fit: Fitted, rows: Rows) -> Rows:
     return match
 
 
+def exchanged(table: Table, plain: Fitted) -> list[Fitted]:
+    """Outliers whose readings fit one another's commands."""
+    rows = np.flatnonzero(~plain.inside & table.counted)
+    count = len(table.commands)
+    if not 2 <= len(rows) <= count // 2 or table.sensed:
+        return []
+    match = assigned(table, plain, rows)
+    moved = np.flatnonzero(match != np.arange(count))
+    if len(moved) < 2:
+        return []
+    code = 2.3 + float(len(moved) * np.log(count))
+    return [fitted(table, Hypothesis("exchanged", match, code), plain.theta)]
+
+
 def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
     """Commands or readings that were sorted without the others."""
     count = len(table.commands)

@@ -334,6 +334,9 @@ def what_is_wrong(
             f"the readings from row {-starts[0][1] % count} on belong to the first "
             "commands, the readings before it to the last"
         )
+    if kind == "exchanged":
+        rows = np.flatnonzero(hypothesis.match != np.arange(count))
+        return f"the readings of rows {', '.join(map(str, rows))} are exchanged"
     if kind in ("offset", "parameters"):
         another = "slope or offset"
         if kind == "offset":
