@@ -202,10 +202,10 @@ def _measurements(
     input_names, output_names = input_names or inputs, output_names or outputs
     inputs = axis_names("input_names", input_names, "u", u.shape[1])
     outputs = axis_names("output_names", output_names, "y", y.shape[1])
-    weight = array_of(
-        "weights", np.ones(len(u)) if weights is None else weights, len(u)
-    )
-    require_none(weight < 0.0, weight, "weights must not be negative")
+    weight = np.ones(len(u))
+    if weights is not None:
+        weight = array_of("weights", weights, len(u))
+        require_none(weight < 0.0, weight, "weights must not be negative")
     return u, y, weight, inputs, outputs
 
 

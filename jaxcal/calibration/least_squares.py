@@ -135,7 +135,10 @@ class FitSolution:
             zero = problem.free & from_zero
             self.parameters = np.where(zero, 0.0, problem.mean)
             self.commands = problem.commands
-            self._predict(problem.measured if from_zero and self.all_free else None)
+            if from_zero and self.all_free:
+                self._take(problem.measured)  # none of which wraps
+            else:
+                self._predict()
             self.weights = np.ones(len(problem.measured))
             self.sizes = problem.model.parameter_sizes()
             self.level = self._first_level()
@@ -146,7 +149,7 @@ class FitSolution:
                 if name in vars(start):
                     setattr(self, name, getattr(start, name))
             if start.problem.white is not problem.white:
-                self.white = self.whitened(self.residuals[..., None])[..., 0]
+                self._take(self.residuals)
                 self.level = self._first_level()
                 self._linearise()
         if linear:
@@ -189,12 +192,13 @@ class FitSolution:
         growth = self._grown[1]
         return white if growth is None else white / growth[..., None]
 
-    def _predict(self, residuals: Array | None = None) -> None:
+    def _predict(self) -> None:
         """Residuals at the present parameters and commands."""
-        if residuals is None:
-            residuals = self._off(self.commands, self.parameters)
+        self._take(self._off(self.commands, self.parameters))
+
+    def _take(self, residuals: Array) -> None:
         self.residuals = residuals
-        self.white = self.whitened(self.residuals[..., None])[..., 0]
+        self.white = self.whitened(residuals[..., None])[..., 0]
 
     def _off(self, commands: Array, theta: Array, finite: bool = True) -> Array:
         """(N, q) measured less predicted."""

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.models import FromFunction, Position, Reading, Sensor, SerialChain, Several
+from jaxcal.models import (
+    Affine,
+    FromFunction,
+    Position,
+    Reading,
+    Sensor,
+    SerialChain,
+    Several,
+)
 
 TRUTH = np.array([1.03, 0.12, 0.07])
 NOISE = jaxcal.Noise([1.0, 0.01])
@@ -94,6 +102,15 @@ class Azimuth(Sensor):
         slopes[:, 0, :2] = np.degrees(np.column_stack([-y, x]) / (x**2 + y**2)[:, None])
         angles = np.degrees(np.arctan2(y, x))[:, None]
         return Reading(angles, slopes, np.zeros((len(x), 1, 0)))
+
+
+def test_a_linear_model_is_fitted_to_readings_that_do_not_wrap_about_zero():
+    class Table(Affine):
+        periods = np.array([360.0])
+
+    u = np.linspace(0.0, 1.0, 15)[:, None]
+    found = jaxcal.identify(u, 300.0 * u + 20.0, model=Table(1, 1))
+    np.testing.assert_allclose(found.parameters, [300.0, 20.0])
 
 
 @pytest.mark.parametrize("several", [False, True])
