@@ -282,12 +282,13 @@ class FromFunction(Model):
         pairs = enumerate(steps.sides)
         values = self._run([job for j, side in pairs for job in jobs(rows, j, side)])
         sides = np.array([steps.sides] * len(rows), dtype=object).T
-        if np.isnan(np.array(values)).any():  # at an edge of what f takes?
-            answered = ~np.isnan(self.predict(rows, theta)).any(axis=1)
+        failed = np.asarray(np.isnan(np.array(values)).any(axis=(0, 2)))
+        if failed.any():  # at an edge of what f takes?
+            failed[failed] = ~np.isnan(self.predict(rows[failed], theta)).any(axis=1)
             for j in range(len(theta)):
                 its = values[4 * j : 4 * j + 4]
                 for side in ("forward", "backward"):
-                    lost = answered & np.isnan(np.array(its)).any(axis=(0, 2))
+                    lost = failed & np.isnan(np.array(its)).any(axis=(0, 2))
                     if lost.any():
                         tried = self._run(jobs(rows[lost], j, side))
                         for old, new in zip(its, tried, strict=True):
