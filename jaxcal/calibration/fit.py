@@ -290,14 +290,11 @@ class Fit:
     @property
     def unseen(self) -> Array:
         """(z, P) directions that nothing determines, as ``linear`` has the slopes."""
-        if self.centre is None:
-            return self._null
-        return self._null @ np.asarray(self.model.centred(self.centre)).T
-
-    @property
-    def _null(self) -> Array:
         null = self.unidentified
-        return np.zeros((0, len(self.estimate))) if null is None else null
+        null = np.zeros((0, len(self.estimate))) if null is None else null
+        if self.centre is None:
+            return null
+        return null @ np.asarray(self.model.centred(self.centre)).T
 
     @functools.cached_property
     def whole(self) -> Model:
@@ -308,7 +305,9 @@ class Fit:
     @property
     def undetermined(self) -> NDArray[np.bool_]:
         """(p,) parameters in directions that nothing determines."""
-        return np.asarray(self._null[:, : len(self.parameters)].any(axis=0))
+        if self.unidentified is None:
+            return np.zeros(len(self.parameters), dtype=np.bool_)
+        return np.asarray(self.unidentified[:, : len(self.parameters)].any(axis=0))
 
     def points(self, name: str, values: ArrayLike, width: int) -> Array:
         """(..., width) commands, or outputs; of a data frame by name."""

@@ -140,7 +140,6 @@ class FitSolution:
             else:
                 self._predict()
             self.weights = np.ones(len(problem.measured))
-            self.sizes = problem.model.parameter_sizes()
             self.level = self._first_level()
             self.facts, self.fact_rows = problem.model.facts(self.parameters)
             self._linearise()
@@ -205,6 +204,11 @@ class FitSolution:
         model = self.problem.model
         predicted = predict(model, commands, theta, finite=finite)
         return model.wrapped(self.problem.measured - predicted, commands)
+
+    @functools.cached_property
+    def sizes(self) -> Array:
+        """(P,) of the parameters, of which a linear model needs none."""
+        return self.problem.model.parameter_sizes()
 
     def _linearise(self) -> None:
         """Derivatives at the present parameters, whitened at level 1."""
@@ -499,7 +503,9 @@ class FitSolution:
         right = self._reduce(0.0)[1] if uncertain else self.white / self.level
         if solved is None or self.problem.noise_known:
             self.freedom = self._freedom(readings)
-        self.distance = self._distance(self.white, self.commands)
+        self.distance = (right**2).sum(axis=1)
+        if uncertain:
+            self.distance = self._distance(self.white, self.commands)
         deleted = deleted_residuals(readings, right)
         self.deleted = np.maximum((right * deleted).sum(axis=1), 0.0)
         return self

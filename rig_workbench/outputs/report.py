@@ -7,9 +7,10 @@ Figures need matplotlib; without it the page says so.
 from __future__ import annotations
 
 import datetime
+import functools
 import json
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,9 @@ def _result(state: RunState, summary: Record) -> list[Section]:
         if state.start["config"].get("model"):
             shown = {"as designed": "before", "calibrated": "prediction"}
         errors = {t: summary[key]["each"] for t, key in shown.items() if key in summary}
-        parts.append(drawn(errors, outputs, state.unit))
+        alt = f"held-out errors in {state.unit}, {' and '.join(errors)}"
+        draw = functools.partial(draw_errors, names=outputs, unit=state.unit)
+        parts.append(drawn(draw, errors, (9, 3.4), alt))
     sections = [Section("Result", parts)] if parts else []
     if changes := summary.get("changed"):
         rows = [[key, str(old), str(new)] for key, (old, new) in changes.items()]
@@ -112,22 +115,50 @@ def _measured(state: RunState, records: list[Record]) -> Section:
     head[1] += f" [{state.axis_unit}]"
     more = f", the first {MOST_ROWS} of them" if len(postures) > MOST_ROWS else ""
     table = Table(head, rows, f"{len(postures)} measured{more}")
-    return Section("Postures", [table])
+    draw = functools.partial(draw_postures, names=state.names[0], unit=state.axis_unit)
+    picture = drawn(draw, postures, (6, 5), "commanded postures")
+    return Section("Postures", [picture, table])
 
 
-def drawn(errors: dict[str, Any], names: Sequence[str], unit: str) -> Any:
-    """Errors at held-out targets, raw beside compensated, each on its scale; words
-    where matplotlib is not installed."""
-    alt = f"held-out errors in {unit}, {' and '.join(errors)}"
+def drawn(
+    draw: Callable[[Any, Any], None], data: Any, size: tuple[float, float], alt: str
+) -> Any:
+    """A block of a page: the figure, or words where matplotlib is not installed."""
     try:
         import matplotlib.figure
 
-        from jaxcal.reports import plots
+        from jaxcal.reports.plots import as_bytes
     except ModuleNotFoundError:
         missing = f"no figure: matplotlib is not installed ({install('plots')})"
         return Text(f"{alt}: {missing}", "note")
-    figure = matplotlib.figure.Figure(figsize=(9, 3.4), layout="constrained")
-    axes = figure.subplots(1, len(errors), squeeze=False)[0]
-    for axis, (title, values) in zip(axes, errors.items(), strict=True):
+    figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
+    draw(figure, data)
+    return Figure(as_bytes(figure, "svg"), alt)
+
+
+def draw_errors(
+    figure: Any, each: dict[str, Any], names: Sequence[str], unit: str
+) -> None:
+    """Errors at held-out targets, raw beside compensated, each on its scale."""
+    from jaxcal.reports import plots
+
+    axes = figure.subplots(1, len(each), squeeze=False)[0]
+    for axis, (title, values) in zip(axes, each.items(), strict=True):
         plots.before_after(axis, {title: values}, names, unit)
-    return Figure(plots.as_bytes(figure, "svg"), alt)
+
+
+def draw_postures(
+    figure: Any, records: list[Record], names: Sequence[str], unit: str
+) -> None:
+    """Commands of all visits, and of those the calibration is identified from; of more
+    than three axes the first three."""
+    from jaxcal.reports import plots
+
+    commands = np.array([r["commanded_deg"] for r in records])[:, :3]
+    chosen = [i for i, r in enumerate(records) if r.get("role") == "select"]
+    names = [f"{name} [{unit}]" for name in names[:3]]
+    if len(names) == 1:  # against nothing
+        commands, names = np.column_stack([commands, 0 * commands]), [*names, ""]
+    axes = figure.add_subplot(projection="3d" if len(names) == 3 else None)
+    shown = chosen or range(len(commands))
+    plots.selection(axes, commands, list(shown), names, label="measured")

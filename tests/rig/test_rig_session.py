@@ -82,7 +82,7 @@ def test_everything_is_saved_and_loads(finished):
         angle = float(row["u_deg_pitch"])
         assert angle == pytest.approx(pulses[0] * 360 / (10000 * 10), abs=1e-6)
     page = (folder / "report.html").read_text()
-    assert page.count("data:image/svg+xml;base64,") == 1
+    assert page.count("data:image/svg+xml;base64,") == 2
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "no patient" in page
 
@@ -389,7 +389,7 @@ def test_without_matplotlib_the_report_says_that_figures_are_missing(
     records = read_journal(finished[0] / "journal.jsonl")
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     page = write_report(tmp_path, records).read_text()
-    assert page.count("matplotlib is not installed") == 1 and "data:image" not in page
+    assert page.count("matplotlib is not installed") == 2 and "data:image" not in page
 
 
 def test_run_folders_are_never_reused(tmp_path):
