@@ -99,6 +99,9 @@ def mispairing(fit: Fit) -> Mispairing | None:
         if froze(fit):
             return None
         seen = _found(of_fit(fit), fit.input_names, fit.output_names, fit.measured_unit)
+        # Linearised on a plateau the table may look worse than the fit itself.
+        rms = np.sqrt((fit.residuals**2).mean(axis=0))
+        seen = seen if seen is None or (seen.noise < rms).any() else None
     if seen is None and not fit.model.linear and fit.model.default_noise() is None:
         return _taken_up(fit)
     return seen
