@@ -157,7 +157,7 @@ def test_the_report_is_one_page_and_figures(
 
 def test_baselines_load_no_jax() -> None:
     script = (
-        "import sys; sys.argv = ['evaluate.py']; from evaluate import evaluate\n"
+        "import sys; sys.argv = ['evaluate.py']; import evaluate\n"
         "code = evaluate.main(['--episodes', '3', '--methods', 'greedy,exact'])\n"
         "bad = [m for m in ('jax', 'flax', 'brax', 'mujoco', 'matplotlib') "
         "if m in sys.modules]\n"
