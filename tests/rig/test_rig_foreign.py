@@ -328,7 +328,8 @@ def test_a_strangers_worn_axis_is_characterised(tmp_path, capsys):
     for name, truth in (("play", 0.284), ("dead zone", 0.0), ("breakaway up", 0.057),
                         ("breakaway down", 0.057)):  # fmt: skip
         low, high = map(
-            float, re.search(f"yaw: {name} .* in {number}\\.\\.{number}", said).groups()
+            float,
+            re.search(f"yaw: {name} .* interval {number}\\.\\.{number}", said).groups(),
         )
         assert low - 0.005 <= truth <= high + 0.005, (name, said)
         assert high - low <= 0.02
