@@ -186,14 +186,13 @@ class Runs:
                     broken.append(futures[future])
                 else:
                     yield futures[future], answer
-            # A run that ends its process takes those beside it along: one by one. What
-            # is held of the first try a cluster would give as the answer again.
-            futures, future = {}, None
+            # A run that ends its process takes those beside it along: one by one, told
+            # from the first try, whose answer a cluster would give again.
             alone = [(j, i) for j, rows in broken for i in range(rows.start, rows.stop)]
             for j, i in alone:
                 self.close()
                 try:
-                    answer = _result(self._submit(jobs[j][0][[i]], jobs[j][1]))
+                    answer = _result(self._submit(jobs[j][0][[i]], jobs[j][1], True))
                 except concurrent.futures.BrokenExecutor:  # a caller's own
                     answer = None
                 self.close()
@@ -203,7 +202,7 @@ class Runs:
             self.close()
             raise
 
-    def _submit(self, commands: Array, parameters: Array) -> Any:
+    def _submit(self, commands: Array, parameters: Array, again: bool = False) -> Any:
         if self._pool is None and isinstance(self.f, CommandLine):
             self._pool = concurrent.futures.ThreadPoolExecutor(self.processes)
         elif self._pool is None:
@@ -218,7 +217,8 @@ class Runs:
                     "the top of a module, and put the code that runs under `if "
                     "__name__ == '__main__':`"
                 ) from None
-        return self._pool.submit(_answer, self.f, self.batch, commands, parameters)
+        asked = self.f, self.batch, commands, parameters
+        return self._pool.submit(_answer, *asked, again)
 
 
 def _result(future: Any) -> Answer | None:
@@ -233,7 +233,11 @@ def _result(future: Any) -> Answer | None:
 
 
 def _answer(
-    f: Callable[..., Any], batch: bool, commands: Array, parameters: Array
+    f: Callable[..., Any],
+    batch: bool,
+    commands: Array,
+    parameters: Array,
+    again: bool = False,  # a cluster knows what was asked by the arguments
 ) -> Answer:
     """The readings of each command that has them, and why the others have none."""
     if batch and len(commands) > 1:
