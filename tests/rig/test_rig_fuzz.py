@@ -9,12 +9,15 @@ import json
 import random
 import re
 import resource
+import types
 
 import numpy as np
 import pytest
 from harness import changed, fast_config, read_words
 from scipy.spatial.transform import Rotation
 
+import rig.drives.bus as bus_module
+import rig.drives.wire as wire_module
 from rig.config.settings import BusSettings
 from rig.drives.bus import Bus
 from rig.drives.line import BusError
@@ -151,14 +154,32 @@ def test_mutated_sensor_logger_messages(count):
             np.testing.assert_allclose(reading.value, right, atol=1e-9)
 
 
+class Clock(types.SimpleNamespace):
+    """The test's own, which goes on where somebody waits."""
+
+    now = 100.0
+
+    def monotonic(self):
+        return self.now
+
+    time = monotonic
+
+    def time_ns(self):
+        return round(1e9 * self.now)
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
 class Replies(Wire):
     """A wire without a line: one prepared reply, then silence.
 
     Questions of an RTU line that owes a reply, which come before, are answered soundly.
     """
 
-    def __init__(self, settings):
+    def __init__(self, settings, clock):
         super().__init__(settings)
+        self.clock = clock
         self.reply = self.sent = self.asked = b""
 
     def open(self):
@@ -180,19 +201,23 @@ class Replies(Wire):
             body = bytes([unit, function, 2 * count]) + bytes(2 * count)
             return body + crc16(body)
         data, self.reply = self.reply, b""
+        if not data:
+            self.clock.sleep(seconds)
         return data
 
 
 @pytest.mark.parametrize("count", SIZES)
 @pytest.mark.parametrize("framer", ["rtu", "socket"])
-def test_mutated_modbus_replies(framer, count):
-    rng = random.Random(count)
+def test_mutated_modbus_replies(framer, count, monkeypatch):
+    rng, clock = random.Random(count), Clock()
+    for module in (bus_module, wire_module):
+        monkeypatch.setattr(module, "time", clock)
     transport = "tcp" if framer == "socket" else "rtu_tcp"
     settings = BusSettings(
         transport=transport, host="x", port=1, timeout_s=0.01, read_retries=0
     )
     bus = Bus(settings)
-    replies = bus._client = Replies(settings)
+    replies = bus._client = Replies(settings, clock)
     bus._timeout_s = 0.0
     reads = writes = 0
     for _ in range(count // 2):
