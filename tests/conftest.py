@@ -15,6 +15,9 @@ _CACHE = pathlib.Path(__file__).parent.parent / ".cache" / "jax"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see runtime/cache.py
 
+# Threads of numpy wait for one another on a busy core: 35 s for what takes one .6.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import hypothesis
 import jax
 import numpy as np
