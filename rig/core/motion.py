@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from rig.config.axis import Axis, Pulses
 from rig.core.device import Device, Posture, approach, check_plan
+from rig.core.heartbeat import SLEPT_S, clock_ahead_s
 from rig.drives.drive import START_S, STILL_COUNTS, Drive, Status
 from rig.drives.line import BusError
 from rig.faults import EndedShort, MotionFault, Unreachable
@@ -20,6 +21,7 @@ TOO_FAST = 1.6  # times the speed that is asked for: more is a fault, but of a c
 LEAST_TURNS_S, LEAST_DEG_S = 0.05, 5.0  # motor, joint: many drives begin at 2 rpm
 SPAN_S = 0.5  # over which a speed is taken, or from the start of the move
 TOOK_POLL_S = 0.05  # of a drive that may have taken a move
+STALE_S = 0.4  # after which drives are looked at again before they move
 LAG_S = 0.1  # of the phone behind a move that is longer than those before
 
 
@@ -52,7 +54,7 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
     """Go as far to a goal as the proof allows, and look; whether it is reached."""
     proof, config = device.proof, device.config
     connection, attitude = _look(device)
-    starts = device.statuses()
+    ahead_s, starts = clock_ahead_s(), device.statuses()
     here = tuple(start.position for start in starts)
     device.check_untouched(here)
     way = config.to_deg(goal) - config.to_deg(here)
@@ -63,11 +65,14 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
     end = proof.begin(device.imu, attitude, here, end)
     for index, drive in enumerate(device.drives):
         drive.axis = proof.paced(index, end[index] - here[index], end[index])
-    device.untrack()  # until it arrives
-    if end != here:
-        device.last_move = label, here, end
     device.heartbeat.feed(moving=True)
     try:
+        late = time.monotonic() - starts[-1].time > STALE_S
+        if late or clock_ahead_s() - ahead_s > SLEPT_S:
+            return False  # a drive may have been off and on since: look again
+        device.untrack()  # until it arrives
+        if end != here:
+            device.last_move = label, here, end
         for index, (drive, pulses) in enumerate(zip(device.drives, end, strict=True)):
             start = starts[index]
             device.guard(moving=True)

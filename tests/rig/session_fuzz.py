@@ -287,7 +287,7 @@ class World:
         elif kind in PHONE:
             self.phone_fault = kind
             self.at(draw.uniform(0.1, 4.0), lambda: setattr(self, "phone_fault", ""))
-        elif kind == "slept":
+        elif kind == "slept" and not self.asleep:
             seconds, begun = draw.choice([0.5, 5.0, 60.0]), self.now
             self.asleep = True
             self.advance(seconds)
@@ -558,6 +558,9 @@ def one_session(world: World, folder: pathlib.Path, targets: list) -> int | None
     """A session, or what goes on with it; its exit code, None if it was killed."""
     said: list[str] = []
     record = harness.commissioned(world.config, folder, world)  # type: ignore[arg-type]
+    if not record.left()[0]:  # as the end of `home` and `axes` leaves them
+        pairs = zip(world.config.axis_names, world.drives, strict=True)
+        record.left_at({name: round(drive.position) for name, drive in pairs})
     run = harness.Run(
         world.config, folder, "calibrate", said.append, record=record,
         start={"simulated": None, "inputs": {}, "maps_from": "."}, reset_alarms=True,
