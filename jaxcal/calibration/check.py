@@ -86,7 +86,7 @@ class Check:
         if self.good:
             return "keep using it"
         if self.mispairing:
-            return "correct the table, then check again"
+            return "correct the table, or repeat these rows, then check again"
         if self.says == "does not hold":
             return (
                 "repeat one of these rows to rule out a wrong reading, then calibrate "
@@ -133,7 +133,9 @@ def check(
     """
     all_commands, measured, _ = recorded(calibration.model, commands, measured)
     say_order(all_commands, measured)
-    commands, measured = _distinct(calibration, all_commands, measured)
+    every = _checked(calibration, all_commands, measured)
+    rows = calibration.model.distinct(*every)
+    commands, measured = (side[rows] for side in every)
     off = _deviations(calibration, commands, measured, placed_anew)
     names, free = calibration.names, off.free
     signal = (off.of_level @ off.by**2).T
@@ -169,7 +171,7 @@ def check(
     says = "cannot be told" if hidden.any() or not free.any() else "holds"
     says = "does not hold" if p_value < _ALARMS else says
     doubted = says == "does not hold" and not placed_anew
-    mispaired = of_new_readings(calibration, commands, measured) if doubted else None
+    mispaired = of_new_readings(calibration, *every) if doubted else None
     units = ["" if unit == "length" else unit for unit in tolerances]
     return Check(
         says=says,
@@ -334,16 +336,14 @@ def _taken_up(calibration: Fit, placed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.linalg.norm(remainder, axis=0) < _BLIND * np.linalg.norm(by, axis=0)
 
 
-def _distinct(
+def _checked(
     calibration: Fit, commands: ArrayLike, measured: ArrayLike
 ) -> tuple[Array, Array]:
-    """Commands (N, n) and readings (N, m), checked, those that are doubled left out."""
+    """Commands (N, n) and readings (N, m)."""
     postures = _postures(calibration, "commands", commands)
     shape, rule = (len(postures), calibration.num_outputs), ": as many rows as commands"
     given = calibration.by_name("measured", measured)
-    readings = array_of("measured", given, *shape, rule=rule)
-    rows = calibration.model.distinct(postures, readings)
-    return postures[rows], readings[rows]
+    return postures, array_of("measured", given, *shape, rule=rule)
 
 
 def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, float]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaxcal.checks import Array
 from jaxcal.late import late
@@ -242,13 +243,32 @@ def _explains_nothing(fit: Fit) -> Reason | None:
     nothing = special.fdtrc(more, dof, ratio) > _CHANCE
     if not nothing.any():
         return None
-    return Reason(
+    ordered: list[str] = []
+    if not in_order(fit.commands, 0.1).any():
+        turned = np.array(fit.output_names)[in_order(fit.measured, 0.7)]
+        ordered = [name for name in names[nothing] if name in turned]
+    text = (
         f"The fit explains nothing of {', '.join(names[nothing])}: a constant fits as "
         f"well (R2 = {_each(np.maximum(1.0 - share[nothing], 0.0))} of "
-        f"{fit.num_measurements} rows).",
+        f"{fit.num_measurements} rows)."
+    )
+    if ordered:
+        text += (
+            f" {', '.join(ordered)} never turns from the first row to the last, which "
+            "the commands do: it was sorted without them, or drifts."
+        )
+    return Reason(
+        text,
         "check that readings and commands belong together (rows, columns, sensor), or "
         "measure over a wider range",
     )
+
+
+def in_order(side: Array, share: float) -> NDArray[np.bool_]:
+    """(columns,) whether one never falls, or never rises, and moves at so many rows."""
+    way = np.sign(np.diff(side, axis=0))
+    moves = np.abs(way).sum(axis=0) >= share * len(side)
+    return np.asarray(moves & (np.ptp(way, axis=0) < 2))
 
 
 def _unknown(fit: Fit) -> Reason | None:

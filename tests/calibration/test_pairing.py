@@ -193,9 +193,41 @@ def test_a_check_names_columns_and_rows():
         result = fit.check(*table)
         assert result.says == "does not hold" and words in result.mispairing, words
         assert words in str(result) and "correct the table" in result.next_step
+    off = read.copy()
+    off[[2, 9]] += 0.6  # twelve times the noise
+    assert "rows 2, 9 off by" in fit.check(new, off).mispairing
+    doubled = fit.check(np.vstack([new[:1], new]), np.vstack([read[:1], off]))
+    assert "rows 3, 10 off by" in doubled.mispairing  # as the caller counts them
     drifted = fit.check(new, read + 0.5)
     assert drifted.says == "does not hold" and not drifted.mispairing
     assert fit.check(new, read).good
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("inputs", [1, 2])
+def test_a_check_names_a_sign_however_few_columns_there_are(inputs, outputs):
+    for seed in range(10):
+        u, y = _table(seed, count=40)
+        slopes = MATRIX[:outputs, :inputs] + 0.5
+        y = u[:, :inputs] @ slopes.T + NOISE * y[:, :outputs]
+        u, rows = u[:, :inputs], slice(30, 50)
+        fit = jaxcal.identify(u[:30], y[:30])
+        turned = y[rows] * np.where(np.arange(outputs) == 0, -1.0, 1.0)
+        assert "has the other sign" in fit.check(u[rows], turned).mispairing, seed
+        if inputs > 1:
+            told = fit.check(u[rows, ::-1], y[rows]).mispairing
+            assert "u_1 and u_2 are exchanged" in told, seed
+        for change in (1.05, 0.7, -0.6):  # another machine
+            assert not fit.check(u[rows], change * y[rows] + 1.0).mispairing, seed
+
+
+def test_one_output_that_was_sorted_is_told():
+    for seed in range(10):
+        u, y = _table(seed)
+        u, y = u[:20, :2], y[:20, :1] - u[:20, 2:]
+        verdict = _verdict(u, np.sort(y, axis=0)).verdict
+        assert not verdict.good and "sorted" in str(verdict), seed
+        assert "sorted" not in str(_verdict(u, np.roll(y, 5, axis=0)).verdict)
 
 
 def test_a_curve_with_a_lost_reading():

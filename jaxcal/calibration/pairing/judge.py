@@ -27,7 +27,7 @@ from jaxcal.calibration.pairing.fit import (
     path_match,
     top,
 )
-from jaxcal.calibration.verdict import froze
+from jaxcal.calibration.verdict import froze, in_rows
 from jaxcal.checks import Array, in_words
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Prior
@@ -44,6 +44,9 @@ _WORTH = 12.0  # log of the odds: of those that are so much worse at first, none
 _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
 _NEXT, _LARGE = 8.0, 3.0  # times the residuals: neighbours, a row
 _USUAL = 2.0  # times the usual noise of a sensor
+_BEFORE = 2.0  # times its noise, a calibration explains readings
+# Of rows that are not explained: times it, times the others, share of all.
+_OFF, _APART_BY, _FEW = 5.0, 1.5, 0.3
 _TREND, _TREND_OF_MANY = 1.4, 2.0  # of a sum of residuals, over their squares' root
 LEAST, _MANY = 6, 500  # rows
 _NAMED = 2  # other explanations
@@ -150,7 +153,27 @@ def of_new_readings(fit: Fit, commands: Array, measured: Array) -> Mispairing | 
     table = dataclasses.replace(
         table, scale=noise, width=table.width * table.scale / noise
     )
-    return _found(table, fit.input_names, fit.output_names, fit.measured_unit)
+    names = fit.input_names, fit.output_names
+    return _found(table, *names, fit.measured_unit) or _rows_off(table)
+
+
+def _rows_off(table: Table) -> Mispairing | None:
+    """Few rows that are far off a calibration which explains the others as before."""
+    right, every = as_it_is(table), np.arange(len(table.commands))
+    off = table.residuals(right, every, table.theta)
+    size = np.abs(off).max(axis=1)
+    far = size > _OFF
+    if not 0 < far.sum() <= _FEW * len(far):
+        return None
+    noise = np.sqrt((off[~far] ** 2).mean(axis=0))
+    if (noise > _BEFORE).any() or size[far].min() < _APART_BY * size[~far].max():
+        return None
+    reason = (
+        f"{in_rows(every[far].tolist())} off by {size[far].min():.2g} times the noise "
+        "or more, the others as before"
+    )
+    match = np.where(far, -1, every)
+    return Mispairing("rows", reason, noise * table.scale, match)
 
 
 def of_fit(fit: Fit) -> Table | None:
@@ -427,6 +450,16 @@ def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     return fits
 
 
+def _as_before(best: Fitted) -> bool:
+    """Whether columns put right leave what a calibration's noise was, which is the unit
+    here: no machine changes as by a sign, a unit or a place."""
+    change = best.hypothesis.change
+    if change is None:
+        return False
+    noise = change(best.noise[None])[0] if change.of_readings else best.noise
+    return bool((np.abs(noise) <= _BEFORE).all())
+
+
 def benign_fits(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
     """The table as it is, with what machines do: drift, curves, another machine."""
     count = len(table.commands)
@@ -449,7 +482,8 @@ def benign_fits(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
                 extras.append(np.maximum(column - knot, 0.0)[:, None])
     at = dataclasses.replace(table, theta=plain.theta)
     fits = [plain, *fits_of(at, [as_it_is(table, extra) for extra in extras])]
-    if not table.free.any():  # a machine that changed since it was calibrated
+    # A machine that changed since it was calibrated.
+    if not (table.free.any() or _as_before(best)):
         ones = np.ones((count, 1))
         for more in (ones, np.hstack([ones, commands])):
             code = more.shape[1] * float(np.log(table.width).sum())

@@ -23,6 +23,7 @@ from jaxcal.calibration.pairing.fit import (
     shifted,
     solved,
 )
+from jaxcal.calibration.verdict import in_order
 from jaxcal.checks import Array
 from jaxcal.models.predictions import predict
 
@@ -291,10 +292,10 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
     if table.sensed or not poor or count > _MOST_ROWS:
         return []
     kinds = []
-    if _in_order(table.commands, 0.1):  # as levels, of which many rows have one
+    if in_order(table.commands, 0.1).any():  # as levels, of which many rows have one
         code = 2.3 + float(np.log(np.arange(1, count + 1)).sum())
         kinds.append(("commands sorted", code))
-    if _in_order(table.measured, 0.7):  # by chance noise is in no order
+    if in_order(table.measured, 0.7).any():  # by chance noise is in no order
         kinds.append(("readings sorted", 5.0 * np.log(count)))
     if not kinds:
         return []
@@ -308,13 +309,6 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
         for kind, code in kinds
         for fit in fits
     ]
-
-
-def _in_order(side: Array, share: float) -> bool:
-    """Whether a column never falls, or never rises, and moves at enough rows."""
-    way = np.sign(np.diff(side, axis=0))
-    moves = np.abs(way).sum(axis=0) >= share * len(side)
-    return bool((moves & (np.ptp(way, axis=0) < 2)).any())
 
 
 def _matched(table: Table, match: Rows) -> Fitted:
