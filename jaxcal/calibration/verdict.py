@@ -247,10 +247,17 @@ def _explains_nothing(fit: Fit) -> Reason | None:
     if not in_order(fit.commands, 0.1).any():
         turned = np.array(fit.output_names)[in_order(fit.measured, 0.7)]
         ordered = [name for name in names[nothing] if name in turned]
+    explained = np.maximum(1.0 - share[nothing], 0.0)
+    of, outputs = f"of {fit.num_measurements} rows", ", ".join(names[nothing])
+    if (explained > 0.5).all():
+        return Reason(
+            f"The fit of {outputs} may be chance: R2 = {_each(explained)} {of} and "
+            f"{int(fit.free.sum())} parameters.",
+            "measure more rows, or over a wider range",
+        )
     text = (
-        f"The fit explains nothing of {', '.join(names[nothing])}: a constant fits as "
-        f"well (R2 = {_each(np.maximum(1.0 - share[nothing], 0.0))} of "
-        f"{fit.num_measurements} rows)."
+        f"The fit explains nothing of {outputs}: a constant fits as well (R2 = "
+        f"{_each(explained)} {of})."
     )
     if ordered:
         text += (
