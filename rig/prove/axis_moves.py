@@ -90,7 +90,11 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
     clear = axis_check.CLEAR * tour.base.std_deg / CORNER_STD_DEG
     clear = int(np.ceil(clear**2 / max(1, len(corners))))
     samples = min(max(clear, config.settle.samples), 8 * config.settle.samples)
-    for signs in corners:
+    # The first sign changes most often: that of the axis with the shortest way.
+    pairs = zip(config.axes, corner, strict=True)
+    quickest = np.argsort([abs(axis.to_deg(count)) for axis, count in pairs])
+    for changed in corners:
+        signs = [changed[rank] for rank in np.argsort(quickest)]
         ways = {j: sign * corner[j] for j, sign in enumerate(signs)}
         tour.visit(axis_check.corner_name(config, signs), ways, samples)
     move(device, Posture("back", start))
@@ -174,11 +178,9 @@ class _Tour:
                 f"unit {axis.unit} turned its motor by {commanded:g} {axis.unit_name} "
                 f"of {axis.name}, and {geometry.told} {turned:.3g}. {BLIND}"
             )
-        # Once more on the way up, where its play is taken up.
-        down = tuple(p - far * (i == j) for i, p in enumerate(self.start))
-        move(self.device, Posture(axis.name, down))
+        # Up to its place its play is taken up on one side, down to it on the other.
         near = look if 2 * abs(look) <= abs(far) else far // 4
-        for name, count in ("look", near), ("plus", far), ("back", 0), ("minus", -far):
+        for name, count in ("back", 0), ("minus", -far), ("look", near), ("plus", far):
             self.visit(f"{axis.name}:{name}", {j: count})
         move(self.device, Posture(axis.name, self.start))
         self.run.say(
