@@ -49,7 +49,13 @@ def test_no_single_swap_of_blocks_improves_the_result(name, q):
         swapped[position, :, position] = np.arange(150)
     twice = np.sort(swapped, axis=2)
     swapped = swapped[(np.diff(twice, axis=2) > 0).all(axis=2)]
-    found = problem.values(swapped)[0]
+    if name == "G":  # by hand: it is a scenario for each row
+        rows = blocks.reshape(-1, 14)
+        information = np.einsum("rkqi,rkqj->rij", blocks[swapped], blocks[swapped])
+        inverse = np.linalg.inv(information + 0.1 * np.eye(14))
+        found = np.einsum("si,rij,sj->rs", rows, inverse, rows, optimize=True).max(1)
+    else:
+        found = problem.values(swapped)[0]
     if problem.criterion.larger_is_better:
         assert found.max() <= best + 1e-8 * max(1.0, abs(best))
     else:
