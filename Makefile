@@ -56,7 +56,7 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 # time. In `make test-all` adaptive and learning compile so, the others as users do.
 # Hundreds of programs are started: what one has compiled the others load.
 test: export PYTHONDONTWRITEBYTECODE =
-# The rig's tests mostly wait for a device and import no JAX: two processes of them run
+# The rig's tests mostly wait for a device and import no JAX: three processes of them run
 # beside the linters and two processes of the others, which compile and give way: a device
 # that is silent for a tenth of a second is a fault. Nothing that failed is run again. Files
 # stay in order:
@@ -65,7 +65,7 @@ test: export PYTHONDONTWRITEBYTECODE =
 QUICK_TESTS = $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 QUICK_RIG_TESTS = $(QUICK_TESTS) -o cache_dir=$(VENV)/rig-cache tests/rig
 test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI runs)
-	@$(QUICK_RIG_TESTS) -n 2 >$(VENV)/rig-tests.log 2>&1 & rig=$$!; \
+	@$(QUICK_RIG_TESTS) -n 3 >$(VENV)/rig-tests.log 2>&1 & rig=$$!; \
 	nice $(BIN)/python -m pytest --collect-only -qq >/dev/null & imports=$$!; \
 	nice $(MAKE) --no-print-directory lint || { kill $$rig $$imports; exit 1; }; wait $$imports; \
 	export XLA_FLAGS="$${XLA_FLAGS-$(QUICK_XLA)}"; \

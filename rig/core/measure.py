@@ -57,8 +57,10 @@ def measure(standing: Arrival, samples: int | None = None) -> dict[str, Any]:
                 readings = []
     attitude = device.geometry.mean(values)
     angles, commanded = frame.angles(attitude), device.config.to_deg(target)
-    feedback = [status.position for status in statuses]
-    _check_position(device, target, feedback)
+    before = [status.position for status in statuses]
+    feedback = [status.position for status in device.statuses()]
+    for places in (before, feedback):  # nobody moved it while it was measured
+        _check_position(device, target, places)
     if device.oriented:
         _check_agreement(device, commanded, angles)
     return {

@@ -225,7 +225,13 @@ def test_four_postures_with_known_noise_have_a_covariance() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"common_noise": True}, {"noise_std": 0.3}, {"weights": True}]
+    "options",
+    [
+        {},
+        pytest.param({"common_noise": True}, marks=pytest.mark.slow),
+        {"noise_std": 0.3},
+        pytest.param({"weights": True}, marks=pytest.mark.slow),
+    ],
 )
 def test_intervals_cover_what_they_promise(options: dict[str, object]) -> None:
     rng = np.random.default_rng(11)

@@ -30,9 +30,10 @@ def test_a_thousand_more(first):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("number", [232, 344, 1322, 2668, 2877, 3056, 3156, 3904])
+@pytest.mark.parametrize("number", [232, 344, 1322, 2668, 2877, 3056, 3156, 3904, 6749])
 def test_sessions_that_broke_a_promise_once(number):
-    """A drive lost its origin between two looks; jogs are others'."""
+    """A drive lost its origin between two looks; a posture was measured while another
+    moved the device; jogs are others'."""
     done = played(number, 1)
     assert done.returncode == 0, done.stdout + done.stderr
 
