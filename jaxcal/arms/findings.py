@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.sensors import Socket, Wrench
 from jaxcal.arms.sensors.sensor import Readings
-from jaxcal.calibration.verdict import Reason, in_rows, outlying
+from jaxcal.calibration.reasons import Reason, in_rows
+from jaxcal.calibration.verdict import outlying
 from jaxcal.checks import Array
 
 if TYPE_CHECKING:

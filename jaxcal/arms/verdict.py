@@ -28,13 +28,8 @@ from jaxcal.arms.plausible import mistaken_columns
 from jaxcal.arms.sensors import Pose, Socket
 from jaxcal.arms.sensors.sensor import Readings, hats
 from jaxcal.calibration import verdict as models
-from jaxcal.calibration.verdict import (
-    Reason,
-    computed,
-    left_out,
-    never_measured,
-    wrong_noise,
-)
+from jaxcal.calibration.reasons import Reason, computed, never_measured
+from jaxcal.calibration.verdict import left_out, wrong_noise
 from jaxcal.checks import Array, one_of
 from jaxcal.information.singular import depends, significant
 

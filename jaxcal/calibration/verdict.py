@@ -7,11 +7,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxcal.calibration.reasons import (
+    Reason,
+    computed,
+    each,
+    in_order,
+    in_rows,
+    never_measured,
+    saturated,
+    short,
+)
 from jaxcal.checks import Array
 from jaxcal.late import late
 
@@ -23,15 +32,11 @@ _CHANCE = 0.01  # that readings of nothing pass for a fit
 _RARE = float(np.log(20.0))  # an outlier
 _TOO_LARGE = 3.0  # times: no caution makes a stated noise that much larger
 _SIZES = 10.0  # of a parameter: known no better, it is not known
+_FAR = 10.0  # times as far off as was stated
 _STEP = 0.1  # standard errors, by which another step would move the parameters
 _BENT, _BENT_MORE = 2.0, 3.0  # times the noise without squares and products of the
 # commands; of a model that is a curve itself
 _SAMPLE, _TERMS = 2000, 600  # readings; twice these terms
-_FROZEN = 3  # readings after the first that repeat it
-_STEPS = 20.0  # of a sensor between readings: with fewer, some repeat by chance
-_EXACT = 1e-12  # of the largest reading: rounding, and no noise of a sensor
-_UNITS = np.outer([1.0, -1.0], [1.0, np.pi / 180.0, 180.0 / np.pi, 1e3, 1e-3]).ravel()
-_NAMED, _DIGITS = 6, 7  # rows in one sentence; decimals of a table
 _CHECK = "a change of the machine (check, jaxcal check)"
 USE = (
     "use it (command_for, jaxcal command); check it with a few new readings after "
@@ -87,109 +92,6 @@ def left_out(fit: Fit) -> Array:
     turned = np.matrix_transpose(vectors) / np.maximum(values, 0.02)[..., None]
     white = vectors @ turned @ root @ fit.residuals[..., None]
     return np.asarray(np.linalg.solve(root, white)[..., 0])
-
-
-class Reason(NamedTuple):
-    """What speaks against a calibration, and what to do about it."""
-
-    fact: str
-    remedy: str
-
-
-# -- readings that were not measured ---------------------------------------------------
-
-
-def never_measured(fit: Fit) -> Reason | None:
-    """Commands pasted as readings, or readings that never change."""
-    return _equals_command(fit) or _stands_still(fit) or froze(fit)
-
-
-def _equals_command(fit: Fit) -> Reason | None:
-    commands, readings = fit.commands, fit.measured
-    if len(commands) < 3 or not (varies := np.ptp(commands, axis=0) > 0.0).any():
-        return None
-    few = commands[:_NAMED, None, :, None] * _UNITS  # (K, 1, n, units), then all
-    size = 0.1 * np.abs(few).max(axis=0)
-    near = np.abs(readings[:_NAMED, :, None, None] - few).max(axis=0) <= size
-    for output, command, unit in np.argwhere(near & varies[:, None]):
-        times, reading = _UNITS[unit], readings[:, output]
-        image = times * commands[:, command]
-        same = 1e-9 * np.abs(image).max()
-        images = (image, *(image.round(digits) for digits in range(_DIGITS)))
-        if any(np.abs(reading - image).max() <= same for image in images):
-            how = "" if times == 1.0 else f" times {_short(times)}"
-            return Reason(
-                f"{fit.output_names[output]} equals the command "
-                f"{fit.input_names[command]}{how} in every row: not measured.",
-                "put the sensor's readings into that column",
-            )
-    return None
-
-
-def _stands_still(fit: Fit) -> Reason | None:
-    readings = fit.measured
-    size = np.abs(readings).max(axis=0)
-    still = (np.abs(readings - readings[0]) <= 1e-14 * size).all(axis=0)
-    if len(readings) < 3 or not still.any():
-        return None
-    slopes = fit.model.jacobian(fit.commands, fit.parameters)[:, still]
-    moves = np.ptp(slopes, axis=0).any(axis=-1)  # not by a constant alone
-    if not moves.any():
-        return None
-    return Reason(
-        f"{', '.join(np.array(fit.output_names)[still][moves])}: the reading never "
-        f"changes: {_each(readings[0, still][moves])} in all {len(readings)} rows.",
-        "check that the sensor is connected, recorded and mounted on the moving part",
-    )
-
-
-def froze(fit: Fit) -> Reason | None:
-    """A reading that repeats over rows of other commands, and nowhere else."""
-    readings = fit.measured
-    least = _EXACT * np.abs(readings).max(axis=0)
-    repeats = abs(readings[1:] - readings[:-1]) <= least
-    if not repeats.any():
-        return None
-    moves = (fit.commands[1:] != fit.commands[:-1]).any(axis=1)
-    repeats &= moves[:, None]
-    counts = repeats.sum(axis=0)
-    for j in ((counts >= _FROZEN) & (counts < len(moves))).nonzero()[0]:
-        (same,) = repeats[:, j].nonzero()
-        said = (readings - fit.residuals)[same, j]
-        if readings[same[0], j] == 0.0 and not fit.model.linear:
-            continue  # contacts, beside readings of another kind
-        if np.ptp(same) >= len(same) or np.ptp(said) <= 1e3 * least[j]:
-            continue  # not one run of rows; a machine that gives way there
-        if not _coarse(readings[:, j]):
-            return Reason(
-                f"{fit.output_names[j]} reads {_short(readings[same[0], j])} in every "
-                f"row from {same[0]} to {same[-1] + 1}, and no other repeats: the "
-                "sensor froze.",
-                "measure these rows (counted from 0) again, or leave them out",
-            )
-    return None
-
-
-def _coarse(readings: Array) -> bool:
-    """Whether readings (N,) are so few steps of a sensor apart that some repeat."""
-    readings = (readings / np.abs(readings).max()).round(12)
-    levels = np.unique(readings)
-    step = float(np.diff(levels).min(initial=np.inf))
-    counts = (levels - levels[0]) / step
-    whole = np.abs(counts - counts.round()).max() < 1e-3
-    return bool(whole and np.median(np.abs(np.diff(readings))) < _STEPS * step)
-
-
-def computed(fit: Fit) -> Reason | None:
-    """Readings that a formula made: their residuals are rounding."""
-    size = np.abs(fit.measured).max(axis=0)
-    exact = np.abs(fit.residuals).max(axis=0) <= _EXACT * size
-    if fit.dof < 0.5 or not exact.all() or not size.any():
-        return None
-    return Reason(
-        "The fit is exact to the last digit: these readings are computed.",
-        "use readings of the machine",
-    )
 
 
 # -- what the fit says -----------------------------------------------------------------
@@ -251,13 +153,13 @@ def _explains_nothing(fit: Fit) -> Reason | None:
     of, outputs = f"of {fit.num_measurements} rows", ", ".join(names[nothing])
     if (explained > 0.5).all():
         return Reason(
-            f"The fit of {outputs} may be chance: R2 = {_each(explained)} {of} and "
+            f"The fit of {outputs} may be chance: R2 = {each(explained)} {of} and "
             f"{int(fit.free.sum())} parameters.",
             "measure more rows, or over a wider range",
         )
     text = (
         f"The fit explains nothing of {outputs}: a constant fits as well (R2 = "
-        f"{_each(explained)} {of})."
+        f"{each(explained)} {of})."
     )
     if ordered:
         text += (
@@ -269,13 +171,6 @@ def _explains_nothing(fit: Fit) -> Reason | None:
         "check that readings and commands belong together (rows, columns, sensor), or "
         "measure over a wider range",
     )
-
-
-def in_order(side: Array, share: float) -> NDArray[np.bool_]:
-    """(columns,) whether one never falls, or never rises, and moves at so many rows."""
-    way = np.sign(np.diff(side, axis=0))
-    moves = np.abs(way).sum(axis=0) >= share * len(side)
-    return np.asarray(moves & (np.ptp(way, axis=0) < 2))
 
 
 def _unknown(fit: Fit) -> Reason | None:
@@ -297,9 +192,30 @@ def _unknown(fit: Fit) -> Reason | None:
         return None
     names = np.array(fit.names)[bad & free]
     return Reason(
-        f"{', '.join(names)}: known only to +-{_each(errors[bad & free])} (1 sigma).",
+        f"{', '.join(names)}: known only to +-{each(errors[bad & free])} (1 sigma).",
         "measure where they matter: select(candidates, model=..., measured=commands); "
         "or start nearer, Prior(mean=...)",
+    )
+
+
+def _far_off(fit: Fit) -> Reason | None:
+    """Parameters whose estimates are far from where their prior, or a model's stated
+    scale, has them."""
+    p = len(fit.names)
+    if fit.model.off_by is None and not fit.prior_precision.any():
+        return None
+    with np.errstate(divide="ignore"):
+        expected = 1.0 / np.sqrt(fit.prior_precision[:p])
+    if fit.model.off_by is not None:
+        expected = np.minimum(expected, fit.model.off_by)
+    away = np.abs(fit.estimate - fit.prior_mean)[:p] / expected
+    far = int(away.argmax())
+    if away[far] <= _FAR:
+        return None
+    return Reason(
+        f"{fit.names[far]} = {short(fit.estimate[far])} is {short(away[far])} times as "
+        f"far from {short(fit.prior_mean[far])} as was stated.",
+        "check the units of commands and readings, and what was stated",
     )
 
 
@@ -356,8 +272,8 @@ def wrong_noise(fit: Fit) -> Reason | None:
     unit = f" {fit.measured_unit}" if fit.measured_unit else ""
     pattern = "; if residuals have a pattern (--report), the model lacks terms"
     return Reason(
-        f"The noise you gave{where} ({_each(noise)}{unit}) is about {_short(ratio)} "
-        f"times too {word}: residuals are {_each(factor * noise)}{unit}.",
+        f"The noise you gave{where} ({each(noise)}{unit}) is about {short(ratio)} "
+        f"times too {word}: residuals are {each(factor * noise)}{unit}.",
         "correct noise_std, --noise, or leave it out" + pattern * bool(small[worst]),
     )
 
@@ -414,8 +330,8 @@ def bends(fit: Fit) -> Reason | None:
         return None
     of_unit = f" {fit.measured_unit}".rstrip()
     return Reason(
-        f"Residuals follow a curve: of a noise of {_each(noise)}{of_unit}, squares and "
-        f"products of the commands would leave {_each(noise * (after / rest) ** 0.5)}"
+        f"Residuals follow a curve: of a noise of {each(noise)}{of_unit}, squares and "
+        f"products of the commands would leave {each(noise * (after / rest) ** 0.5)}"
         f"{of_unit}.",
         "identify with a model that has these terms (Polynomial or another), or "
         "measure over a smaller range",
@@ -436,26 +352,9 @@ def outlying(fit: Fit, rows: Sequence[int]) -> Reason | None:
     )
 
 
-def in_rows(rows: Sequence[int]) -> str:
-    """``rows 3, 14``, the first few of many."""
-    named = ", ".join(map(str, rows[:_NAMED]))
-    more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
-    return f"row{'s' * (len(rows) > 1)} {named}{more}"
-
-
 def _in_noise(fit: Fit, white: Array) -> bool:
     """Whether the fit took residuals in noise as these (N, m), no row unlike others."""
     return bool(np.isclose((white**2).sum(), fit.square, rtol=1e-6))
-
-
-def _each(values: Array) -> str:
-    """Numbers with a comma between, those that are alike once."""
-    return ", ".join(dict.fromkeys(_short(value) for value in values))
-
-
-def _short(value: float) -> str:
-    """A number of two digits, without an exponent below a million."""
-    return f"{float(f'{value:.2g}'):g}"
 
 
 Rule = Callable[["Fit"], Reason | None]
@@ -464,6 +363,8 @@ RULES: tuple[Rule, ...] = (
     _undetermined,
     _explains_nothing,
     _unknown,
+    _far_off,
+    saturated,
     _on_its_way,
     wrong_noise,
     lambda fit: None if wrong_noise(fit) else outlying(fit, [*fit.outliers]),

@@ -90,6 +90,7 @@ class FromFunction(Model):
             raise ValueError("nominal must hold at least one parameter, got none")
         self.names = parameter_names(names, len(self.nominal))
         self.scale = self._scale(scale)
+        self.off_by = None if scale is None else self.scale
         self._num_inputs: int | None = None
         self.inputs = ()  # names of the commands, where they have some
         if isinstance(inputs, int):

@@ -78,6 +78,7 @@ class Model(abc.ABC):
         def num_outputs(self) -> int: ...
 
     inputs: Any = ()
+    off_by: Any = None  # (p,) from nominal, that parameters may be, as stated
     linear: ClassVar[Any] = False  # ``f(u; theta) = J(u) theta``, J exact
     multiplicity: ClassVar[Any] = 0  # m where all outputs share one regressor
     relative: ClassVar[Any] = False  # readings are relative to the commands, as turns

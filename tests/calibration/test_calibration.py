@@ -862,11 +862,11 @@ def test_twelve_rows_are_identified_in_few_calls(rng: np.random.Generator) -> No
         identify(commands, measured)
     finally:
         sys.setprofile(None)
-    # Of 1,297 the fit takes 490 and the verdict 625, a quarter of it for the pairing of
-    # the rows, another for outliers that least squares hides, 9 for a sensor that froze
-    # (1,290 before that was looked for); a fit of 1,640 took four
-    # times as long as the closed form.
-    assert calls[0] < 1300
+    # Of 1,322 the fit takes 490 and the verdict 650, a quarter of it for the pairing of
+    # the rows, another for outliers that least squares hides, 25 for a sensor at the end
+    # of its range and parameters far from what was stated (1,297 before these were
+    # looked for); a fit of 1,640 took four times as long as the closed form.
+    assert calls[0] < 1325
 
 
 @pytest.mark.parametrize("size", [1e300, 1e155, 1e-155, 1e-300])

@@ -39,6 +39,7 @@ class ColumnChange:
     of_readings: bool
     order: tuple[int, ...]  # column i is the table's order[i]
     factors: tuple[float, ...]  # times this
+    estimated: bool = False  # the factors, from the readings
 
     def __call__(self, values: Array) -> Array:
         """(N, k) put right."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxcal.calibration.pairing.benign import BEFORE, SESSIONS, benign_fits
 from jaxcal.calibration.pairing.fit import (
     FOREIGN,
     ColumnChange,
@@ -27,7 +28,7 @@ from jaxcal.calibration.pairing.fit import (
     path_match,
     top,
 )
-from jaxcal.calibration.verdict import froze, in_rows
+from jaxcal.calibration.reasons import froze, in_rows
 from jaxcal.checks import Array, in_words
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Prior
@@ -44,7 +45,6 @@ _WORTH = 12.0  # log of the odds: of those that are so much worse at first, none
 _EXACT = 1e-6  # of the spread: readings so near a fit have nothing to explain
 _NEXT, _LARGE = 8.0, 3.0  # times the residuals: neighbours, a row
 _USUAL = 2.0  # times the usual noise of a sensor
-_BEFORE = 2.0  # times its noise, a calibration explains readings
 # Of rows that are not explained: times it, times the others, share of all.
 _OFF, _APART_BY, _FEW = 5.0, 1.5, 0.3
 _TREND, _TREND_OF_MANY = 1.4, 2.0  # of a sum of residuals, over their squares' root
@@ -73,7 +73,7 @@ class Mispairing:
     @property
     def mendable(self) -> bool:
         """Whether ``repaired`` puts the table right."""
-        return self.kind not in ("offset", "parameters")
+        return self.kind not in SESSIONS
 
     def repaired(self, commands: Array, measured: Array) -> tuple[Array, Array]:
         """The rows of the table that belong together, (K, n) and (K, q); a ValueError
@@ -81,6 +81,11 @@ class Mispairing:
         if not self.mendable:
             raise ValueError(
                 "a table of two sessions cannot be repaired: identify each alone"
+            )
+        if self.change is not None and self.change.estimated:
+            raise ValueError(
+                f"{self.change.words}: how many exactly is not known. Write the "
+                "readings in the model's unit"
             )
         rows = np.flatnonzero(self.match >= 0)
         paired, readings = commands[self.match[rows]], measured[rows]
@@ -166,7 +171,7 @@ def _rows_off(table: Table) -> Mispairing | None:
     if not 0 < far.sum() <= _FEW * len(far):
         return None
     noise = np.sqrt((off[~far] ** 2).mean(axis=0))
-    if (noise > _BEFORE).any() or size[far].min() < _APART_BY * size[~far].max():
+    if (noise > BEFORE).any() or size[far].min() < _APART_BY * size[~far].max():
         return None
     reason = (
         f"{in_rows(every[far].tolist())} off by {size[far].min():.2g} times the noise "
@@ -251,6 +256,10 @@ def _found(
     if not fits:
         return None
     best = max(fits, key=lambda fit: fit.evidence)
+    if best.hypothesis.kind == "parameters":  # an offset says it in fewer words
+        offsets = [fit for fit in fits if fit.hypothesis.kind == "offset"]
+        as_good = (x for x in offsets if x.evidence > best.evidence - _AS_GOOD)
+        best = next(as_good, best)
     if best.evidence - plain.evidence <= _SURE:
         best = next((fit for fit in fits if fit.hypothesis.kind == _APART), best)
     if not better(plain, best):
@@ -308,6 +317,7 @@ def _as_good(table: Table, best: Fitted, fits: list[Fitted]) -> list[Fitted]:
         near = fit.evidence > best.evidence - _AS_GOOD - fewer * row
         kind = best.hypothesis.kind, best.hypothesis.change
         same = kind == (other.kind, other.change)
+        same |= {kind[0], other.kind} <= SESSIONS
         if near and not same:
             as_good.append(fit)
     return as_good
@@ -447,45 +457,4 @@ def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     for search in (_apart, exchanged, sorted_alone):
         with contextlib.suppress(ValueError):
             fits += search(table, plain)
-    return fits
-
-
-def _as_before(best: Fitted) -> bool:
-    """Whether columns put right leave what a calibration's noise was, which is the unit
-    here: no machine changes as by a sign, a unit or a place."""
-    change = best.hypothesis.change
-    if change is None:
-        return False
-    noise = change(best.noise[None])[0] if change.of_readings else best.noise
-    return bool((np.abs(noise) <= _BEFORE).all())
-
-
-def benign_fits(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
-    """The table as it is, with what machines do: drift, curves, another machine."""
-    count = len(table.commands)
-    time = np.linspace(-1.0, 1.0, count)[:, None]
-    extras = [time, np.hstack([time, time**2])]
-    for column in table.commands.T:  # approached from one side
-        extras.append(np.sign(np.gradient(column))[:, None])
-    commands = table.commands - table.commands.mean(axis=0)
-    commands = commands / (commands.std(axis=0) + 1e-300)
-    n = commands.shape[1]
-    i, j = np.triu_indices(n)
-    squares = commands[:, i] * commands[:, j]
-    cubes = np.hstack([squares[:, i == j], commands**3])
-    for more in (squares, cubes, np.hstack([cubes, time])):
-        if more.shape[1] + n + 1 < count // 2:
-            extras.append(more)
-    if best.hypothesis.kind in ("offset", "parameters"):
-        for column in commands.T:
-            for knot in np.quantile(column, np.linspace(0.1, 0.9, 9)):
-                extras.append(np.maximum(column - knot, 0.0)[:, None])
-    at = dataclasses.replace(table, theta=plain.theta)
-    fits = [plain, *fits_of(at, [as_it_is(table, extra) for extra in extras])]
-    # A machine that changed since it was calibrated.
-    if not (table.free.any() or _as_before(best)):
-        ones = np.ones((count, 1))
-        for more in (ones, np.hstack([ones, commands])):
-            code = more.shape[1] * float(np.log(table.width).sum())
-            fits += fits_of(at, [as_it_is(table, more, code)])
     return fits

@@ -23,7 +23,7 @@ from jaxcal.calibration.pairing.fit import (
     shifted,
     solved,
 )
-from jaxcal.calibration.verdict import in_order
+from jaxcal.calibration.reasons import in_order
 from jaxcal.checks import Array
 from jaxcal.models.predictions import predict
 
@@ -38,13 +38,20 @@ _UNITS = {
     "is too small by 100": 100.0,
     "is too large by 100": 0.01,
 }
+_COUNTS = (200, 400, 1000, 2000, 4096, 10_000, 16_384, 65_536)  # of a turn
+_TURNS_OF = {"degrees": 360.0, "radians": 2.0 * np.pi}
+_TURNED = 0.05  # turns, at least, of commands that may be in counts
+_ALIKE, _MULTIPLE = 1.1, 0.05  # of factors; of the readings' squares, that is left
 _DECADES = {0.01, 0.1, 10.0, 100.0}  # by which a nominal may be off
 _COLUMNS = 6  # changes of columns that are fitted one by one
 _MOST = 30  # columns that are tried one by one
 _PLACES = 2  # of a sensor, that are tried
 _KINDS = np.log(10.0)
 _ROWS = 50  # that are predicted in each unit
-_FACTOR, _LEFT_OVER = 1.5, 0.6  # between machine and nominal; of the readings' squares
+# Between machine and nominal, and where is stated how far off that may be; shares of
+# the readings' squares that a change leaves.
+_FACTOR, _FACTOR_STATED = 1.5, 1.2
+_LEFT_OVER, _AS_GOOD_SHARE = 0.6, 1e-4
 _MOST_ROWS = 150  # of a table whose lost order is looked for
 _STARTS, _REFINED, _ROUNDS = 12_000, 8, 12  # of that search: rows times starts, ...
 _SOLVED = 0.003  # share of the squares that the right order leaves
@@ -60,7 +67,9 @@ def changed_columns(
     if table.shared or not (plain.rms > least * table.width).any():
         return []
     tables, every = [], np.flatnonzero(table.counted)
-    for hypothesis in _kinds_of_columns(table, inputs, outputs):
+    theta = table.theta if not table.free.any() else table.mean
+    expected = None if table.model.linear and table.free.any() else theta
+    for hypothesis in _kinds_of_columns(table, inputs, outputs, expected):
         anew = _anew(table, hypothesis, every)
         with contextlib.suppress(ValueError):  # the number of a chain has no sign
             if anew is not None:
@@ -79,17 +88,24 @@ def by_nominal(
     """A change by which the prior's mean explains readings that it does not without: a
     nonlinear fit may take up a unit or a sign in a parameter."""
     rows = np.flatnonzero(table.counted)[:_ROWS]
-    if (_unexplained(table, as_it_is(table), rows) < 1.0).all():
+    said = predict(table.model, table.commands[rows], table.mean, finite=False)
+    if (_unexplained(table, as_it_is(table), rows, said) < 1.0).all():
         return None
     kinds = [
         hypothesis
-        for hypothesis in _kinds_of_columns(table, inputs, outputs)
+        for hypothesis in _kinds_of_columns(table, inputs, outputs, table.mean)
         if hypothesis.change and _DECADES.isdisjoint(hypothesis.change.factors)
     ]
     if not kinds:
         return None
-    shares = [_unexplained(table, hypothesis, rows) for hypothesis in kinds]
-    best = min(range(len(kinds)), key=lambda i: shares[i].sum())
+    shares = np.array([_unexplained(table, x, rows, said) for x in kinds])
+    order = np.argsort(shares.sum(axis=1), kind="stable")
+    best = int(order[0])
+    change = kinds[best].change
+    if change and change.estimated and len(order) > 1:  # unless a unit is as good
+        unit = int(order[1])
+        if (shares[unit] <= 4.0 * shares[best] + _AS_GOOD_SHARE).all():
+            best = unit
     if (shares[best] >= _LEFT_OVER).any():
         return None
     nominal = dataclasses.replace(table, theta=table.mean)
@@ -100,24 +116,33 @@ def by_nominal(
     return None
 
 
-def _unexplained(table: Table, hypothesis: Hypothesis, rows: Rows) -> Array:
+def _unexplained(
+    table: Table, hypothesis: Hypothesis, rows: Rows, outputs: Array
+) -> Array:
     """(q,) share of the readings' squares about their means left by the prior's mean,
-    whose outputs may be larger or smaller by a factor."""
+    whose ``outputs`` (K, q) at the commands as they stand may be larger or smaller."""
     readings = table.readings_of(hypothesis, rows)
     commands = table.commands_of(hypothesis, rows)
-    outputs = predict(table.model, commands, table.mean, finite=False)
+    change = hypothesis.change
+    if change is not None and not change.of_readings:
+        outputs = predict(table.model, commands, table.mean, finite=False)
     with np.errstate(all="ignore"):
         ratio = (readings * outputs).sum(axis=0) / (outputs**2).sum(axis=0)
-        off = readings - outputs * np.clip(ratio, 1.0 / _FACTOR, _FACTOR)
+        most = _FACTOR if table.model.off_by is None else _FACTOR_STATED
+        off = readings - outputs * np.clip(ratio, 1.0 / most, most)
         off = table.model.wrapped(off, commands)
         share = (off**2).sum(axis=0) / (readings.var(axis=0) * len(rows))
     return np.nan_to_num(share, nan=np.inf, posinf=np.inf)
 
 
 def _kinds_of_columns(
-    table: Table, inputs: Sequence[str], outputs: Sequence[str]
+    table: Table,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    theta: Array | None = None,
 ) -> list[Hypothesis]:
-    """Columns with another sign or unit, or in the place of another's."""
+    """Columns with another sign or unit, or in the place of another's; where parameters
+    ``theta`` (p,) are expected also in counts."""
     moved = table.commands.shape[1] - table.sensed
     tables = [(inputs, len(inputs), moved, False)]
     if not table.model.relative:
@@ -134,7 +159,16 @@ def _kinds_of_columns(
             for what, factor in {"has the other sign": -1.0, **units}.items():
                 kinds.append((f"{names[i]} {what}", [i], factor))
         side = "the readings" if of_readings else "the commands"
-        for what, factor in units.items() if count > 1 else ():
+        together = {"has the other sign": -1.0, **units} if count > 1 else {}
+        if theta is not None and units and moved and not of_readings:
+            most = np.ptp(table.commands[:, :moved], axis=0).max()
+            together |= {
+                f"is in counts of {count} a turn, not in {unit}": turn / count
+                for unit, turn in _TURNS_OF.items()
+                for count in _COUNTS
+                if most > _TURNED * count
+            }
+        for what, factor in together.items():
             every = f"every column of {side} {what}"
             kinds.append((every, [*range(count)], factor))
         for i, j in itertools.combinations(singly, 2):
@@ -149,6 +183,10 @@ def _kinds_of_columns(
                 order[columns] = columns[::-1]
             places = tuple(order.tolist()), tuple(factors.tolist())
             changes.append(ColumnChange(words, of_readings, *places))
+    if theta is not None and (times := _multiple(table, theta)):
+        words = f"the readings are {times:.3g} times what the parameters say (counts?)"
+        places = tuple(range(len(outputs))), (1.0 / times,) * len(outputs)
+        changes.append(ColumnChange(words, True, *places, estimated=True))
     code, several = _KINDS + np.log(len(changes) + 1.0), np.log(20.0)
     rows = np.arange(len(table.commands))
     costs = [
@@ -158,6 +196,25 @@ def _kinds_of_columns(
         Hypothesis("columns", rows, code + cost, change=x)
         for x, cost in zip(changes, costs, strict=True)
     ]
+
+
+def _multiple(table: Table, theta: Array) -> float:
+    """How many times the predictions all readings are, where it is no unit's factor; 0
+    where they are no multiple of these."""
+    rows = np.flatnonzero(table.counted)[:_ROWS]
+    said = predict(table.model, table.commands[rows], theta, finite=False)
+    read = table.measured[rows]
+    with np.errstate(all="ignore"):
+        times = (read * said).sum(axis=0) / (said**2).sum(axis=0)
+        rest = ((read - said * times) ** 2).sum(axis=0) / (read**2).sum(axis=0)
+        units = [1.0, *(x for x in _UNITS.values() if x not in _DECADES)]
+        apart = np.abs(np.log(np.abs(times) / np.array([units]).T))
+        alike = times.max() < _ALIKE * times.min()
+        if not (alike and times.min() > 0.0 and (rest < _MULTIPLE).all()):
+            return 0.0
+    most = _FACTOR if table.model.off_by is None else _FACTOR_STATED
+    near_unit = (apart < np.log(most)).all(axis=1).any()
+    return 0.0 if near_unit else float(np.median(times))
 
 
 def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:

@@ -254,16 +254,18 @@ def _blocks(
 def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     """Rows of two sessions: from one on another offset, or other parameters too."""
     table, count = systems.table, len(systems.table.commands)
-    if not (table.shared or table.free.any()):
-        return []
     scored: list[tuple[float, Hypothesis]] = []
     after = np.arange(count)
     code = _KINDS + np.log(count)
     slopes, right, _ = systems.of(after[None])
     slopes, right = slopes[0], right[0]
-    kinds = [("offset", np.ones((count, 1)), _LEAST)]
+    ones = np.ones((count, 1))
+    kinds = [("offset", ones, _LEAST)]
     if table.shared:
         kinds.append(("parameters", slopes[:, 0], slopes.shape[-1] + 2))
+    elif table.model.linear and not table.free.any():  # calibrated before
+        moved = np.hstack([ones, table.commands - table.commands.mean(axis=0)])
+        kinds.append(("parameters", moved, moved.shape[-1] + 2))
     before = np.append(0, _distinct(table.commands)[:-1])
     behind = _distinct(table.commands[::-1])[::-1]
     for kind, factors, least in kinds:

@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.calibration.pairing.benign import benign_fits
 from jaxcal.calibration.pairing.fit import as_it_is, fitted, predicted
 from jaxcal.calibration.pairing.judge import (
     LEAST,
     RATIO,
     Mispairing,
-    benign_fits,
     better,
     of_fit,
 )
-from jaxcal.calibration.verdict import Reason, Verdict, bends, in_rows
+from jaxcal.calibration.reasons import Reason, in_rows
+from jaxcal.calibration.verdict import Verdict, bends
 from jaxcal.checks import in_words
 
 if TYPE_CHECKING:
