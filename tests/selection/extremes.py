@@ -98,7 +98,7 @@ def trees() -> None:
                 tree = kernel.Tree(
                     likelihood, np.full((designs, designs), price, np.float32), tables,
                     np.ones((outcomes, designs), np.float32),
-                    np.zeros((designs, outcomes), np.int32), tables[0], tables[0],
+                    np.zeros((designs, outcomes), np.int32), tables[0],
                     np.ones(designs, np.float32), 6, [1.0, 1.0, 1.0, 1.0, 1.0, 0.3],
                     np.ones((1, designs), np.float32), effort,
                 )  # fmt: skip
