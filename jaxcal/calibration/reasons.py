@@ -20,6 +20,7 @@ _UNITS = np.outer([1.0, -1.0], [1.0, np.pi / 180.0, 180.0 / np.pi, 1e3, 1e-3]).r
 _NAMED, _DIGITS = 6, 7  # rows in one sentence; decimals of a table
 _ENDS, _END_SHARE = 4, 0.15  # rows at the end of a sensor's range, at least
 _TWICE = 1.1  # rows of a value within it, in the mean, at most
+_FLAT = 0.05  # of the readings: a fit that moves less there is flat itself
 
 
 class Reason(NamedTuple):
@@ -157,7 +158,7 @@ def saturated(fit: Fit) -> Reason | None:
         if rows.sum() < least or len(inner) < 2 or inner.mean() > _TWICE:
             continue
         said = (readings - fit.residuals)[rows, j]
-        if np.ptp(said) > 0.1 * (high - low)[j]:  # where the fit moves
+        if np.ptp(said) > _FLAT * (high - low)[j]:  # where the fit moves
             values = np.array([(low, high)[i][j] for i in ends])
             return Reason(
                 f"{fit.output_names[j]} reads {each(values)} in {rows.sum()} of "

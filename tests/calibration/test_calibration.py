@@ -863,7 +863,7 @@ def test_twelve_rows_are_identified_in_few_calls(rng: np.random.Generator) -> No
     finally:
         sys.setprofile(None)
     # Of 1,322 the fit takes 490 and the verdict 650, a quarter of it for the pairing of
-    # the rows, another for outliers that least squares hides, 25 for a sensor at the end
+    # the rows, another for outliers that least squares hides, 25 for a sensor at an end
     # of its range and parameters far from what was stated (1,297 before these were
     # looked for); a fit of 1,640 took four times as long as the closed form.
     assert calls[0] < 1325

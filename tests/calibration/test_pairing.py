@@ -221,6 +221,66 @@ def test_a_check_names_a_sign_however_few_columns_there_are(inputs, outputs):
             assert not fit.check(u[rows], change * y[rows] + 1.0).mispairing, seed
 
 
+def test_a_check_names_two_sessions_and_what_is_wrong_with_all_columns():
+    u, y = _table(count=50)
+    y = y[:, :2]
+    u, fit = u[:, :2], jaxcal.identify(u[:30, :2], y[:30] - 0.05 * u[:30, 2:])
+    new = u[30:50]
+    read = fit.predict(new) + NOISE * np.random.default_rng(1).normal(size=(20, 2))
+    later = (np.arange(20) >= 9)[:, None]
+    for words, readings in (
+        ("from row 9 on the readings have another offset, by (0.", read + 0.5 * later),
+        ("from row 9 on the readings have another slope", read * (1.0 + 0.2 * later)),
+        ("every column of the readings has the other sign", -read),
+        ("the readings are 11.4 times", read * 4096 / 360),
+    ):
+        result = fit.check(new, readings)
+        assert result.says == "does not hold" and words in result.mispairing, words
+        assert "; or " not in result.mispairing
+    drift = np.linspace(0.0, 1.0, 20)[:, None]
+    for readings in (read + 0.5, read * 1.1, read + drift, read):
+        assert not fit.check(new, readings).mispairing
+
+
+def test_commands_in_counts_are_told_by_the_nominal_and_mend_the_table():
+    def reach(commands, theta):
+        a, b = np.radians(commands[:, 0]), np.radians(commands.sum(axis=1) + theta[2])
+        along = theta[0] * np.cos(a) + theta[1] * np.cos(b)
+        return np.stack([along, theta[0] * np.sin(a) + theta[1] * np.sin(b)], axis=1)
+
+    model = jaxcal.models.FromFunction(
+        reach, [310.0, 190.0, 0.0], scale=[3.0, 3.0, 1.5], batch=True
+    )
+    rng = np.random.default_rng(3)
+    commands = rng.uniform([-80.0, -120.0], [80.0, 120.0], (20, 2))
+    readings = reach(commands, [312.0, 188.0, 1.0]) + rng.normal(size=(20, 2))
+    counts = _verdict(commands * 4096 / 360, readings, model=model)
+    assert "commands is in counts of 4096 a turn" in counts.verdict.reasons[0]
+    repaired = counts.mispairing.repaired(commands * 4096 / 360, readings)
+    np.testing.assert_allclose(repaired[0], commands, rtol=1e-12)
+    scaled = _verdict(commands, readings * 4096 / 360, model=model)
+    assert "11.4 times what the parameters say" in scaled.verdict.reasons[0]
+    with pytest.raises(ValueError, match="how many exactly is not known"):
+        scaled.mispairing.repaired(commands, readings)
+    assert "as far from 310 as was stated" in str(
+        _verdict(commands, readings * 200 / 360, model=model).verdict
+    )
+    assert _verdict(commands, readings, model=model).verdict.good
+
+
+@pytest.mark.parametrize(("low", "high"), [(-8.0, 8.0), (-99.0, 10.0)])
+def test_a_sensor_at_the_end_of_its_range_is_told(low, high):
+    for seed in range(10):
+        u, y = _table(seed)
+        y = np.clip(y[:20, :1], low, high)
+        found = _verdict(u[:20], y)
+        if np.isin(y, (low, high)).sum() > 4:
+            assert "the end of the sensor's range" in str(found.verdict), seed
+        for digits in (0, 1, 2):  # repeats of a coarse sensor are none
+            coarse = _verdict(u[:20], _table(seed)[1][:20].round(digits)).verdict
+            assert "range?" not in str(coarse), seed
+
+
 def test_one_output_that_was_sorted_is_told():
     for seed in range(10):
         u, y = _table(seed)
@@ -407,6 +467,8 @@ def test_many_rows_of_which_one_output_stands_still_divide_by_no_zero(rng):
         ("y_1 is in radians", 1.0, np.pi / 180.0),
         ("every column of the commands is too small by 1000", 1e-3, 1.0),
         ("y_1 has the other sign", 1.0, -1.0),
+        ("times what the parameters say (counts?)", 1.0, 65536 / 360),
+        ("times what the parameters say (counts?)", 1.0, 10.0),
         ("", 1.0, 1.0),
     ],
 )
