@@ -25,6 +25,8 @@ _DELIMITERS = "\t;, "  # the first of those that serve alike
 _OF_R = " \t"  # with which R names rows, and not the column of these names
 _LOOKED_AT = 20  # rows by which the delimiter is judged
 _BREAK = re.compile(r"\s*\n\s*")  # of a line, in a quoted cell
+# A line that begins with #, unless that is a spreadsheet's error: #DIV/0!, #N/A, #NV.
+_COMMENT = re.compile(r"\s*#(?!([¡¿]?[^\W\da-z][^\sa-z]*[!?]|N/[AD]|NV)\s*([,;\t]|$))")
 
 
 def read_table(path: Any) -> Table:
@@ -193,7 +195,7 @@ def _without_comments(
     """Lines that begin with # made empty, and the last one above all others; a table
     whose header or whose rows begin so keeps them."""
     filled = [i for i, line in enumerate(lines) if line.strip()]
-    begin = [i for i in filled if lines[i].lstrip().startswith("#")]
+    begin = [i for i in filled if _COMMENT.match(lines[i])]
     if not begin or re.match(r"\s*#\s*[,;\t]", lines[filled[0]]):
         return lines, None
     above = [i for i, j in zip(begin, filled, strict=False) if i == j]

@@ -194,6 +194,32 @@ def test_rows_whose_names_begin_with_a_hash_stay():
     assert numbered.decisions["#"].role == "left out"
 
 
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+@pytest.mark.parametrize(
+    "cell",
+    [
+        *("#VALUE!", "#N/A", "#DIV/0!", "#NUM!", "#NAME?", "#REF!", "#NULL!"),
+        *("#WERT!", "#BEZUG!", "#ZAHL!", "#NV", "#ÜBERLAUF!", "#VALEUR!", "#NOMBRE!"),
+        *("#N/D", "#¡VALOR!", "#¿NOMBRE?"),
+    ],
+)
+def test_an_error_of_a_spreadsheet_is_no_comment(cell, mark):
+    rows = [["u_a", "u_b"], ["1", "2"], [cell, "3"], ["4", "5"], ["7", "1"]]
+    for places in [0, 1], [1, 0], [0]:
+        text = "\n".join(mark.join(row[i] for i in places) for row in rows)
+        with pytest.raises(ValueError, match="line 3, column 'u_a' must hold a number"):
+            parse("t.csv", text.encode()).columns(["u_a"])
+
+
+@pytest.mark.parametrize(
+    "comment", ["# VALUE!", "#note", "#NOTE! see below", "#N/A is a gap", "#a,b", "#NB"]
+)
+def test_comments_stay_comments(comment):
+    with pytest.warns(UserWarning, match="ignored comment .*: line 3"):
+        table = parse("t.csv", f"a,b\n1,2\n{comment}\n4,5\n".encode())
+    assert table.lines == (2, 4)
+
+
 def test_lines_are_those_of_the_file():
     with pytest.warns(UserWarning, match="units are taken from line 3"):
         table = parse("t.csv", b"# a\na,b\nmm,mm\n# c\n1,2\n\n3,nan\n")
