@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from jaxcal.arms.arm import Load
 from jaxcal.arms.sensors import SENSORS, Position, Sensor
 from jaxcal.checks import Array, array_of, in_words, numbers, one_of, whole_number
+from jaxcal.tables import limits_of_frame
 
 
 def rows_of(table: ArrayLike) -> Array:
@@ -61,6 +62,7 @@ def limits_of(pairs: ArrayLike | None, columns: int) -> Array:
     open_ended = np.tile([-np.inf, np.inf], (columns, 1))
     if pairs is None:
         return open_ended
+    pairs = limits_of_frame(pairs, ())
     limits = array_of("limits", pairs, columns, 2, finite=False)  # None becomes NaN
     limits = np.where(np.isnan(limits), open_ended, limits)
     bad = np.flatnonzero(limits[:, 0] > limits[:, 1])

@@ -342,7 +342,7 @@ class SerialChain(Arm, Model):
             at = [j + self.sensor.inputs.index(name) for name in one.inputs]
             noise = one.stds(self.length)
             named.append(OneTable(one.kind, i, [*range(j), *at], noise, *pair))
-        return stacked(named, j, self.num_inputs, self.num_outputs)
+        return stacked(named, j, self.inputs, self.num_inputs, self.num_outputs)
 
     @functools.cached_property
     def command_units(self) -> tuple[str, ...]:

@@ -307,7 +307,7 @@ class Chains(Model):
             k = self.tips.index(one_of("tip", tip, self.tips))
             named.append(OneTable(tip, k, self._columns[k], self._scale(k), *pair))
         place, q = len(self.joint_names), self.num_outputs
-        return stacked(named, place, self.num_inputs, q)
+        return stacked(named, place, self.inputs, self.num_inputs, q)
 
     def require_commands(self, commands: Array) -> None:
         for k, arm, _, arm_commands in self._parts(commands):

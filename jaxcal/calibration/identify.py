@@ -204,6 +204,7 @@ def _measurements(
     outputs = axis_names("output_names", output_names, "y", y.shape[1])
     weight = np.ones(len(u))
     if weights is not None:
+        say_order(commands, weights, ("commands", "weights"))
         weight = array_of("weights", weights, len(u))
         require_none(weight < 0.0, weight, "weights must not be negative")
     return u, y, weight, inputs, outputs

@@ -18,6 +18,7 @@ from jaxcal.information.singular import (
 )
 from jaxcal.models.identifiability import unknown
 from jaxcal.models.predictions import derivative, predict
+from jaxcal.tables import limits_of_frame
 
 _NAMED = 3  # targets in a warning
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
@@ -115,6 +116,7 @@ def limits_of(limits: ArrayLike | None, names: tuple[str, ...]) -> Array:
     """(n, 2), least below greatest, with at least one finite command between them."""
     if limits is None:
         return np.tile([-np.inf, np.inf], (len(names), 1))
+    limits = limits_of_frame(limits, names)
     bounds = array_of("limits", limits, len(names), 2, finite=False)
     low, high = bounds.T
     bad = np.flatnonzero(~((low <= high) & (low < np.inf) & (high > -np.inf)))

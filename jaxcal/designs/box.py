@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import Array, array_of, in_words
 from jaxcal.deadline import Deadline
 from jaxcal.models.model import Model
+from jaxcal.tables import limits_of_frame
 
 Allowed = Callable[[Array], Any]
 
@@ -94,8 +95,8 @@ class Box:
         return drawn
 
 
-def box_of(limits: ArrayLike, allowed: Allowed | None) -> Box:
-    box = array_of("limits", limits, "n", 2)
+def box_of(limits: ArrayLike, allowed: Allowed | None, names: Sequence[str]) -> Box:
+    box = array_of("limits", limits_of_frame(limits, names), "n", 2)
     bad = box[~(box[:, 0] < box[:, 1])]
     if not len(box) or len(bad):
         got = in_words(bad[0]) if len(bad) else "none"

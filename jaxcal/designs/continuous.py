@@ -107,7 +107,7 @@ def optimise(
         ValueError: naming the argument, the rule and the value.
     """
     deadline = Deadline(seconds("time_limit", time_limit))
-    box = box_of(limits, allowed)
+    box = box_of(limits, allowed, getattr(model, "inputs", ()))
     n, starts = len(box.limits), whole_number("starts", starts, 1)
     model = as_model(model) if model is not None else Affine(n, n)
     count = affordable(model, box, deadline, max(16, 3 * (k or 1)), POOL)
@@ -163,7 +163,7 @@ def refine(
     require_none(outside, rows, f"selection must lie in [0, {len(candidates)})")
     begun = candidates[rows]
     limits = _range(candidates[available], allowed) if limits is None else limits
-    box, n = box_of(limits, allowed), candidates.shape[1]
+    box, n = box_of(limits, allowed, offer.columns), candidates.shape[1]
     if len(box.limits) != n:
         got = box.limits.shape
         raise ValueError(f"limits must be ({n}, 2) for this model, got {got}")
@@ -228,7 +228,7 @@ def _refined(
         np.arange(len(best)), float(value[0]), float(log_det[0]),
         "optimise" if begun is None else "refine", False, ascent.deadline.elapsed_s,
         problem, seed=ascent.seed, known_bound=float(criterion_within.reported(bound)),
-        axes=offer.axes or getattr(offer.model, "inputs", None) or None,
+        axes=offer.axes or offer.columns or None,
         began=began, certain=certain,
     )  # fmt: skip
 
@@ -276,5 +276,6 @@ def _judged(ascent: Ascent, commands: Array, criterion: Any, region: Any) -> Pro
     beside = CandidateSet(
         np.concatenate([commands, pool]), offer.model, offer.prior, offer.noise,
         offer.measured, scenarios=tuple(offer.scenarios) if joint else None,
+        axes=offer.axes,
     ).checked()  # fmt: skip
     return problem_of(beside, len(commands), criterion, region)

@@ -286,8 +286,9 @@ def _text(value: Any) -> str:
 def _new_section(
     calibration: Fit, commands: ArrayLike, measured: ArrayLike
 ) -> pages.Section:
-    off = np.asarray(measured, float) - calibration.outputs_at(commands)
-    off = calibration.model.wrapped(off, np.asarray(commands, float))
+    commands = calibration.points("commands", commands, calibration.num_inputs)
+    off = calibration.points("measured", measured, calibration.num_outputs)
+    off = calibration.model.wrapped(off - calibration.outputs_at(commands), commands)
     std = calibration.predict_std(commands, new_measurement=True)
     kinds = ("off", "off in standard deviations")
     head = [f"{name} {kind}" for kind in kinds for name in calibration.output_names]

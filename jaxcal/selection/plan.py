@@ -413,6 +413,7 @@ def _request(
         offer = dataclasses.replace(offer, noise=None if shared else Noise(std))
     problem = problem_of(offer, total, "D")
     blocks = blocks_of(dataclasses.replace(offer, noise=None), not shared)
+    region = offer.by_name("region", region)
     names, rows = blocks.names, _region_rows(blocks, problem, region)
     if of_parameters:
         at = positions(names if parameters is None else parameters, names)

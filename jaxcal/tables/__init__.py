@@ -5,6 +5,7 @@ from jaxcal.tables.files import csv_text, parse, read_table
 from jaxcal.tables.frames import (
     header_of,
     inputs_of,
+    limits_of_frame,
     names_in,
     of_frame,
     outputs_of,
@@ -22,6 +23,7 @@ __all__ = [
     "csv_text",
     "header_of",
     "inputs_of",
+    "limits_of_frame",
     "names_in",
     "of_frame",
     "outputs_of",

@@ -18,6 +18,8 @@ from jaxcal.tables.decisions import (
 )
 from jaxcal.tables.table import Table, table_of
 
+_ENDS = ("low", "high"), ("min", "max")  # of limits, by name
+
 
 def header_of(argument: str, values: Any) -> list[str]:
     """Names of the columns of a frame, or of a row's numbers; [] where there are none.
@@ -135,8 +137,13 @@ def of_frame(
     return values.astype(kind)  # float32 is rounded, which ``select`` must know
 
 
-def say_order(commands: Any, measured: Any) -> None:
+def say_order(
+    commands: Any,
+    measured: Any,
+    names: tuple[str, str] = ("commands", "measured"),
+) -> None:
     """Say that two frames whose indices differ are paired by place."""
+    first, second = names
     pair = getattr(commands, "index", None), getattr(measured, "index", None)
     one, other = ([] if x is None or callable(x) else [*x] for x in pair)
     if one != other and len(one) == len(other) and set(one) & set(other):
@@ -144,9 +151,9 @@ def say_order(commands: Any, measured: Any) -> None:
         what = "the same index in different orders" if same else "indices that differ"
         k = next(k for k in range(len(one)) if one[k] != other[k])
         say(
-            f"commands and measured have {what}. Rows are "
-            f"paired by position: row {k} is {one[k]!r} in commands and {other[k]!r} "
-            "in measured. To pair by index use measured.loc[commands.index]"
+            f"{first} and {second} have {what}. Rows are "
+            f"paired by position: row {k} is {one[k]!r} in {first} and {other[k]!r} "
+            f"in {second}. To pair by index use {second}.loc[{first}.index]"
         )
 
 
@@ -191,15 +198,38 @@ def _require_no_rows_of(
     argument: str, frame: Any, wanted: Sequence[str], prefix: str
 ) -> None:
     """Refuse a frame, or an array of xarray, whose rows have the columns' names."""
-    rows: Any = getattr(frame, "index", ())
-    if _is_labelled(frame):
-        axis = frame.coords.get(frame.dims[0]) if frame.ndim > 1 else None
-        rows = () if axis is None else axis.values.tolist()
-    rows = [] if callable(rows) else [row for row in rows if isinstance(row, str)]
+    rows = _rows_of(frame)
     if rows and None not in columns_by_name(wanted, rows, prefix):
         raise ValueError(
             f"{argument}: {', '.join(rows)} are names of rows; transpose it (.T)"
         )
+
+
+def _rows_of(frame: Any) -> list[str]:
+    """Names of the rows of a frame, or of an array of xarray; [] without them."""
+    rows: Any = getattr(frame, "index", ()) if hasattr(frame, "columns") else ()
+    if hasattr(frame, "dims") and getattr(frame, "ndim", 2) > 1:
+        axis = frame.coords.get(next(iter(frame.dims)))
+        rows = () if axis is None else axis.values.tolist()
+    texts = [row for row in rows if isinstance(row, str)]
+    return texts if len(texts) == len(rows) else []
+
+
+def limits_of_frame(limits: Any, names: Sequence[str]) -> Any:
+    """(n, 2) limits of inputs that have names, of a frame or a dict by these: "low" and
+    "high", or "min" and "max", and those of the inputs; else as given."""
+    limits = _collected(limits)
+    columns, rows = header_of("limits", limits), _rows_of(limits)
+    if columns and not rows:
+        rows = table_of_frame("limits", limits).row_names or []
+    ends = next((pair for pair in _ENDS if {*pair} & {*columns, *rows}), ())
+    wanted = [ends if {*ends} & {*x} else names or x for x in (columns, rows)]
+    if columns:
+        limits = of_frame("limits", limits, wanted[0], COMMANDS, [False])
+    if rows:
+        by_row = dict(zip(rows, np.asarray(limits), strict=True))
+        limits = of_frame("limits", by_row, wanted[1], COMMANDS, [False]).T
+    return limits.T if columns and wanted[0] is not ends else limits
 
 
 def table_of_frame(argument: str, frame: Any) -> Table:

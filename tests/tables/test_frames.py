@@ -241,3 +241,90 @@ def test_names_of_rows_are_refused():
     np.testing.assert_allclose(fit.command_for(targets), expected)
     with pytest.raises(ValueError, match=r"c, a, b are names of rows; transpose it"):
         fit.command_for(targets.T)
+
+
+LIMITS = pandas.DataFrame(
+    {"high": [50.0, 1.0, 9.0], "low": [0.0, -1.0, -9.0]}, index=["yaw", "pitch", "roll"]
+)
+
+
+@pytest.mark.filterwarnings("ignore:.* clipped:UserWarning")
+@pytest.mark.parametrize(
+    "limits",
+    [
+        LIMITS,
+        LIMITS.T,
+        LIMITS.rename(columns={"low": "min", "high": "max"}),
+        LIMITS[["low", "high"]].set_axis([0, 1], axis=1),
+        LIMITS.loc[[*AXES]].reset_index(drop=True),
+        LIMITS.reset_index(names="axis"),
+        {name: (row.low, row.high) for name, row in LIMITS.iterrows()},
+        collections.namedtuple("Limits", LIMITS.index)(
+            (0.0, 50.0), (-1.0, 1.0), (-9.0, 9.0)
+        ),
+    ],
+    ids=lambda limits: type(limits).__name__,
+)
+def test_limits_are_read_by_name(calibration, limits):
+    target, plain = TARGETS.iloc[0], LIMITS.loc[[*AXES], ["low", "high"]].to_numpy()
+    commands = [
+        calibration.command_for(target, limits=one, clip=True)
+        for one in (limits, plain)
+    ]
+    np.testing.assert_array_equal(*commands)
+    model = jaxcal.models.Linear("1 + pitch + yaw + roll", inputs=AXES)
+    designs = [
+        jaxcal.optimise(one, 4, model, starts=1, time_limit=1.0).commands
+        for one in (limits, plain)
+    ]
+    np.testing.assert_array_equal(*designs)
+
+
+def test_limits_of_other_names_are_refused(calibration):
+    for other, missing in (
+        (LIMITS.rename(index={"yaw": "jaw"}), "'yaw' is missing .columns: jaw"),
+        (LIMITS.rename(columns={"low": "from"}), "'low' is missing .columns: high, f"),
+        ({"yaw": (0.0, 1.0)}, "'pitch' is missing"),
+    ):
+        with pytest.raises(ValueError, match=f"limits needs .*{missing}"):
+            calibration.command_for(TARGETS, limits=other, clip=True)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_commands_beside_candidates_are_read_by_name(named):
+    model = jaxcal.models.Linear("1 + pitch + yaw + roll + I(pitch**2)", inputs=AXES)
+    where, limits = COMMANDS.iloc[:5], [[-20.0, 20.0]] * 3
+    candidates = COMMANDS if named else U
+    moved, plain = where[["roll", "pitch", "yaw"]], where.to_numpy()
+    answers = []
+    for at in (moved, plain):
+        design = jaxcal.Design(candidates, model, measured=at)
+        motion = jaxcal.Motion((10.0, 1.0, 5.0), (10.0, 1.0, 5.0))
+        answers.append(
+            [
+                design.select(6).value,
+                design.select(6, jaxcal.I(at)).value,
+                design.select(6, "G", region=at).value,
+                design.plan(1.0, noise_std=0.1, region=at).standard_error[0],
+                design.fastest(
+                    5, motion, start=at.loc[0] if at is moved else at[0]
+                ).seconds,
+                jaxcal.optimise(
+                    limits, 6, model, region=at, criterion="I", starts=1
+                ).value,
+                design.refine([*range(6)], criterion="I", region=at, starts=1).value,
+            ]
+        )
+    np.testing.assert_array_equal(*answers)
+    with pytest.raises(ValueError, match=r"region needs .* 'roll' is missing"):
+        jaxcal.select(
+            candidates, 6, model=model, region=where[["yaw", "pitch"]], criterion="I"
+        )
+
+
+def test_an_index_of_available_in_another_order_is_said():
+    flags = pandas.Series([1, 0] * 6, index=range(12)).iloc[::-1]
+    with pytest.warns(UserWarning, match="candidates and available have the same ind"):
+        jaxcal.select(COMMANDS, 4, available=flags)
+    with pytest.warns(UserWarning, match="commands and weights have the same index"):
+        jaxcal.identify(COMMANDS, READINGS, noise_std=0.01, weights=flags)

@@ -21,6 +21,7 @@ from jaxcal.arms.sensors.sensor import (
 )
 from jaxcal.checks import Array, array_of
 from jaxcal.models.model import Quantity
+from jaxcal.tables import COMMANDS, of_frame
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -264,13 +265,16 @@ class OneTable(NamedTuple):
 
 
 def stacked(
-    tables: Iterable[OneTable], label: int, n: int, q: int
+    tables: Iterable[OneTable], label: int, inputs: Sequence[str], n: int, q: int
 ) -> tuple[Array, Array]:
     """Commands (N, n) and readings (N, q) in noise of all tables, one after another;
-    ``label`` is the column of their numbers."""
+    ``label`` is the column of their numbers, ``inputs`` (n,) names, if any."""
     all_commands, all_measured = [], []
     for name, number, columns, noise, given, readings in tables:
-        rows = array_of(f"commands of {name}", given, "N", len(columns))
+        what = f"commands of {name}"
+        if inputs:
+            given = of_frame(what, given, [inputs[i] for i in columns], COMMANDS)
+        rows = array_of(what, given, "N", len(columns))
         commands, measured = np.zeros((len(rows), n)), np.zeros((len(rows), q))
         commands[:, label], commands[:, columns] = number, rows
         if readings is not None:

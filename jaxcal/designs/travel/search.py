@@ -162,6 +162,7 @@ class _TourSearch:
         self.times = travel_times(points, points, motion)
         self.start = np.zeros(len(points))
         if start is not None:
+            start = offer.by_name("start", start)
             where = array_of("start", start, *points.shape[1:])
             self.start = travel_times(where[None], points, motion)[0]
         self.settle = float(motion.settle) * self.k

@@ -85,7 +85,7 @@ def _problem_of_one(
         if len(root) > root.shape[1]:  # as much in fewer rows
             root = np.linalg.qr(root)[1]
     blocks.require_identified(offer.measured)
-    where = criterion.region
+    where = offer.by_name("region", criterion.region)
     if where is None and criterion.of_region:
         where = blocks.predicted()
     region = None if where is None else blocks.at("region", where, readings=False)

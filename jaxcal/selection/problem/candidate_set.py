@@ -33,6 +33,7 @@ from jaxcal.tables import (
     inputs_of,
     names_in,
     of_frame,
+    say_order,
     table_of_frame,
 )
 
@@ -147,19 +148,14 @@ class CandidateSet:
         require_kind("prior", self.prior, Prior)
         given = self.candidates
         if header_of("candidates", given):
-            wanted = getattr(self.model, "inputs", ())
+            say_order(given, self.available, ("candidates", "available"))
             mask = self.available = _available(given, self.available)
-            if wanted:
+            if wanted := self.columns:
                 self.axes = names_in("candidates", given, wanted, COMMANDS, ())
             else:
                 self.axes = inputs_of("candidates", given)
-            columns, words = wanted or self.axes, getattr(self.model, "levels", ())
-            self.measured = of_frame(
-                "measured", self.measured, columns, COMMANDS, None, words
-            )
-            self.candidates = of_frame(
-                "candidates", given, self.axes, COMMANDS, mask, words
-            )
+            self.candidates = self.by_name("candidates", given, mask)
+        self.measured = self.by_name("measured", self.measured)
         array = filled("candidates", self.candidates, "M", "n")
         spacing = rounding_of(self.candidates)
         self.names = _names_of_rows(given, self.names, len(array))
@@ -186,6 +182,19 @@ class CandidateSet:
         else:
             self._leave_unanswered(model)
         self.candidates.flags.writeable = False
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """(n,) names by which commands in a frame are read; () where there are none."""
+        return getattr(self.model, "inputs", ()) or self.axes or ()
+
+    def by_name(self, argument: str, commands: Any, used: Any = None) -> Any:
+        """The columns of commands in a frame, in the candidates' order; else as
+        given."""
+        if not self.columns:
+            return commands
+        words = getattr(self.model, "levels", ())
+        return of_frame(argument, commands, self.columns, COMMANDS, used, words)
 
     def _leave_unanswered(self, model: Model) -> None:
         """Mask candidates for which the model fails; a warning names them."""
