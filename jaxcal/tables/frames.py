@@ -97,14 +97,28 @@ def _column(values: Any, name: str) -> Any:
         raise ValueError(f"a row lacks {name!r}") from None
 
 
-def _cells(values: Any) -> Any:
-    """An array of numbers, or of what is none a list of cells."""
-    array = np.asarray(values)
+def _shape(column: Any) -> tuple[int, ...]:
+    """Shape of a column as it says, (N,) of lists that differ in length."""
+    try:
+        return np.shape(column)
+    except ValueError:
+        return (len(column),)
+
+
+def _cells(column: Any) -> Any:
+    """A flat array of numbers, or of what is none a list of cells."""
+    try:
+        array = np.asarray(column)
+    except ValueError:
+        array = np.empty(0)
+    if array.shape != _shape(column):
+        return [*map(str, column)]  # structs, or lists
+    array = array.ravel()
     if array.dtype.kind in "iuf":
         return array
     if array.dtype.kind in "mM":
         array = array.astype(str)
-    cells = array.astype(object).ravel().tolist()
+    cells = array.astype(object).tolist()
     return ["" if str(x) in ("None", "nan", "NaT", "<NA>") else str(x) for x in cells]
 
 
@@ -125,8 +139,14 @@ def of_frame(
     if names is None:
         return frame
     columns = [_column(frame, name) for name in names]
-    shape = np.broadcast_shapes(*map(np.shape, columns))
-    cells = [_cells(np.ravel(column)) for column in columns]
+    shape = _shape(columns[0])
+    for name, column in zip(names, columns, strict=True):
+        if _shape(column) != shape:
+            raise ValueError(
+                f"{argument}: column {name!r} must have the shape {shape} of "
+                f"{names[0]!r}, got {_shape(column)}"
+            )
+    cells = [*map(_cells, columns)]
     named = dict(zip(names, cells, strict=True))
     table = table_of(argument, named, range(math.prod(shape)), None, row="row")
     used = None if used is None else np.asarray(used)
@@ -244,7 +264,15 @@ def table_of_frame(argument: str, frame: Any) -> Table:
             f"{argument} must be a path or have names of its columns, got "
             f"{type(frame).__name__}"
         )
-    columns = {name: _cells(np.atleast_1d(_column(frame, name))) for name in header}
+    columns = {}
+    for name in header:
+        column = _column(frame, name)
+        if len(shape := _shape(column)) > 1 and not _is_labelled(frame):
+            raise ValueError(
+                f"{argument}: column {name!r} must hold one number a row, got the "
+                f"shape {shape}"
+            )
+        columns[name] = _cells(column)
     count = len(columns[header[0]])
     for name, cells in columns.items():
         if len(cells) != count:

@@ -328,3 +328,39 @@ def test_an_index_of_available_in_another_order_is_said():
         jaxcal.select(COMMANDS, 4, available=flags)
     with pytest.warns(UserWarning, match="commands and weights have the same index"):
         jaxcal.identify(COMMANDS, READINGS, noise_std=0.01, weights=flags)
+
+
+FIVE = [1.0, 2.0, 4.0, 8.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("maker", "cells", "got"),
+    [
+        (of_polars, [{"p": i} for i in range(5)], r"\{'p': 0\}"),
+        (of_polars, [[i] * (i + 1) for i in range(5)], r"\[0\]"),
+        (pandas.DataFrame, [{"p": i} for i in range(5)], r"\{'p': 0\}"),
+        (dict, [[i] * (i + 1) for i in range(5)], r"\[0\]"),
+    ],
+)
+def test_cells_that_hold_more_than_a_number_are_named(maker, cells, got):
+    frame = maker({"u_a": cells, "u_b": FIVE})
+    with pytest.raises(ValueError, match=f"row 0, column 'u_a' must .* got .{got}"):
+        jaxcal.select(frame)
+    fit = jaxcal.identify({"u_a": FIVE, "u_b": FIVE[::-1]}, {"y_c": FIVE})
+    with pytest.raises(ValueError, match=f"row 0, column 'u_a' must .* got .{got}"):
+        fit.predict(frame)
+
+
+def test_variables_of_two_axes_are_named_with_the_rule(calibration):
+    xarray = pytest.importorskip("xarray")
+    grid = {name: (("p", "q"), U[:, i].reshape(3, 4)) for i, name in enumerate(AXES)}
+    for frame in (xarray.Dataset(grid), {x: values for x, (_, values) in grid.items()}):
+        with pytest.raises(
+            ValueError, match=r"'pitch' must hold one number a row, got"
+        ):
+            jaxcal.select(frame)
+        outputs = calibration.predict(frame)
+        np.testing.assert_array_equal(outputs, calibration.predict(U.reshape(3, 4, 3)))
+    mixed = xarray.Dataset(grid | {"roll": (("p",), U[:3, 2])})
+    with pytest.raises(ValueError, match=r"'roll' must have the shape .3, 4. of 'pit"):
+        calibration.predict(mixed)
