@@ -342,7 +342,7 @@ def _checked(
     """Commands (N, n) and readings (N, m)."""
     postures = _postures(calibration, "commands", commands)
     shape, rule = (len(postures), calibration.num_outputs), ": as many rows as commands"
-    given = calibration.by_name("measured", measured)
+    given = calibration.by_name("measured", measured, quiet=measured is commands)
     return postures, array_of("measured", given, *shape, rule=rule)
 
 

@@ -224,7 +224,7 @@ class Fit:
         rows = points.reshape(-1, self.num_inputs)
         sides = [(self.input_names, rows, self._range)]
         say_far("command", slice(None), sides)
-        return self.outputs_at(commands)
+        return self.outputs_at(points)
 
     def outputs_at(self, commands: ArrayLike) -> Array:
         """``predict`` without a warning."""
@@ -318,12 +318,15 @@ class Fit:
             )
         return points
 
-    def by_name(self, name: str, values: ArrayLike) -> Any:
-        """The calibration's columns of a data frame, in its order; else as given."""
+    def by_name(self, name: str, values: ArrayLike, *, quiet: bool = False) -> Any:
+        """The calibration's columns of a data frame, in its order; else as given. What
+        it has beside them is said, unless ``quiet``."""
+        inputs, outputs = self.input_names, self.output_names
         if name in ("desired", "measured", "readings"):
-            return of_frame(name, values, self.output_names, MEASURED)
+            beside = None if quiet else inputs
+            return of_frame(name, values, outputs, MEASURED, beside=beside)
         levels = getattr(self.model, "levels", ())
-        return of_frame(name, values, self.input_names, COMMANDS, levels=levels)
+        return of_frame(name, values, inputs, COMMANDS, None, levels, outputs)
 
     def require_noise(self, what: str) -> Array:
         if self.noise_std is None:

@@ -129,10 +129,12 @@ def of_frame(
     prefix: str,
     used: Any = None,
     levels: Sequence[Sequence[str]] = (),
+    beside: Collection[str] | None = None,
 ) -> Any:
     """The ``wanted`` columns (..., n) of a frame, or of rows, by name; else as given.
 
-    ``used`` (N,) and ``levels`` as of ``Table.columns``, whose errors it raises.
+    ``used`` (N,) and ``levels`` as of ``Table.columns``, whose errors it raises; of
+    numbers all but these and ``beside`` are said.
     """
     frame = _collected(frame)
     names = names_in(argument, frame, wanted, prefix)
@@ -148,6 +150,15 @@ def of_frame(
             )
     cells = [*map(_cells, columns)]
     named = dict(zip(names, cells, strict=True))
+    if beside is not None:
+        every = {x: _cells(_column(frame, x)) for x in header_of(argument, frame)}
+        numbers = {
+            name: column
+            for name, column in every.items()
+            if isinstance(column, np.ndarray) and len(column) == len(cells[0])
+        }
+        of_numbers = table_of(argument, numbers, range(len(cells[0])), None, row="row")
+        _say_unread(argument, of_numbers, names, prefix, beside)
     table = table_of(argument, named, range(math.prod(shape)), None, row="row")
     used = None if used is None else np.asarray(used)
     values = table.columns(names, used, levels).reshape(*shape, len(names))
@@ -208,10 +219,20 @@ def names_in(
             f"{wanted[names.index(None)]!r} is missing (columns: {', '.join(header)})"
         )
     if beside is not None:
-        spare = table_of_frame(argument, frame).unread(names, prefix, beside)
-        if spare:
-            say(f"{argument}: {spare}")
+        _say_unread(argument, table_of_frame(argument, frame), names, prefix, beside)
     return tuple(names)
+
+
+def _say_unread(
+    argument: str,
+    table: Table,
+    names: Sequence[str],
+    prefix: str,
+    beside: Collection[str],
+) -> None:
+    """Say the columns of numbers of a table that are neither these nor ``beside``."""
+    if spare := table.unread(names, prefix, beside):
+        say(f"{argument}: {spare}")
 
 
 def _require_no_rows_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import warnings
 
 import numpy as np
 import pytest
@@ -364,3 +365,22 @@ def test_variables_of_two_axes_are_named_with_the_rule(calibration):
     mixed = xarray.Dataset(grid | {"roll": (("p",), U[:3, 2])})
     with pytest.raises(ValueError, match=r"'roll' must have the shape .3, 4. of 'pit"):
         calibration.predict(mixed)
+
+
+def test_what_is_not_needed_is_said_once(calibration):
+    both = pandas.concat([COMMANDS, READINGS], axis=1).assign(note="a", index=range(12))
+    more = both.assign(depth=np.arange(12.0) ** 2)
+    for question, argument in (
+        (calibration.predict, "commands"),
+        (calibration.predict_std, "commands"),
+        (calibration.command_for, "desired"),
+        (lambda row: calibration.command_for(row.iloc[0]), "desired"),
+        (calibration.check, "commands"),
+        (lambda rows: calibration.verification(rows, 3), "candidates"),
+    ):
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            question(more)
+            question(both)
+        texts = [str(warning.message) for warning in said]
+        assert texts == [f"{argument}: column 'depth' is ignored (not needed)"]
