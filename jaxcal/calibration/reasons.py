@@ -146,14 +146,15 @@ def computed(fit: Fit) -> Reason | None:
 def saturated(fit: Fit) -> Reason | None:
     """Readings of many rows that are the largest or the least of all, to the last
     digit, while hardly any other value is read twice."""
-    readings, least = fit.measured, max(_ENDS, _END_SHARE * fit.num_measurements)
+    readings = fit.measured
+    least = max(_ENDS, _END_SHARE * len(readings))
     low, high = readings.min(axis=0), readings.max(axis=0)
     step = 1e-11 * (abs(low) + abs(high))
-    at_ends = [readings <= low + step, readings >= high - step]
-    counts = [rows.sum(axis=0) for rows in at_ends]
-    for j in (counts[0] + counts[1] > least).nonzero()[0]:
+    at_ends = np.array([readings <= low + step, readings >= high - step])
+    counts = at_ends.sum(axis=1)
+    for j in (counts.sum(axis=0) > least).nonzero()[0]:
         ends = [i for i in (0, 1) if counts[i][j] > 1]
-        rows = np.any([at_ends[i][:, j] for i in ends], axis=0)
+        rows = at_ends[ends, :, j].any(axis=0)
         inner = np.unique((readings[~rows, j] / step[j]).round(), return_counts=True)[1]
         if rows.sum() < least or len(inner) < 2 or inner.mean() > _TWICE:
             continue

@@ -98,7 +98,9 @@ def ambiguous(cells: Sequence[str], mark: str, decided: bool) -> int | None:
         rest = [cell for cell in rest if cell.casefold() not in _MISSING]
         if all(cell.lstrip("+-").isdecimal() for cell in rest):
             largest = max((abs(float(cell)) for cell in rest), default=0.0)
-            if _LEAST <= largest < 1000.0:
+            # Who writes 8.200 with its last zero writes -38.000 too.
+            zeros = any(cells[i].endswith("0") for i in decimals)
+            if (1.0 if zeros else _LEAST) <= largest < 1000.0:
                 return decimals[0]
     return None
 

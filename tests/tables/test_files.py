@@ -133,6 +133,14 @@ def test_one_decimal_mark_for_all_cells(cells, numbers):
             "u_a,u_b\n-838,1\n14.036,2\n",
             "line 3, column 'u_a': '14.036' may mean 14036",
         ),
+        (
+            "a,b\n12.500,4\n-83,1\n40.000,2\n",
+            "line 2, column 'a': '12.500' may mean 12500",
+        ),
+        (
+            "a;b\n8,200;4\n-38;1\n14,036;2\n",
+            "line 2, column 'a': '8,200' may mean 8200",
+        ),
         ('a,b\n"1,234",1\n"2,345",2\n', "line 2, column 'a': '1,234' may mean 1234"),
         ("a;b\n1,5;2\n3.5;1\n2,5;4\n", "line 3, column 'a' must hold a number, got"),
         ("u_a,u_on\n1,fast\n2,slow\n", "line 2, column 'u_on' must .* got 'fast'"),
