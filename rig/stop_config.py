@@ -22,6 +22,9 @@ from rig.registers import registers_in as count_of
 MAP_FOLDER = pathlib.Path(__file__).parent / "maps"
 HEADER = re.compile(r"\s*\[+\s*([A-Za-z_][\w.\s\"'-]*?)[^\w\"']*(#.*)?")
 ASSIGNMENT = re.compile(r"\s*([\w-]+)\s*[=:]\s*(.+?)\s*(#.*)?")
+NUMBER = re.compile(
+    r"(?<![\w.])(?:0[xX]\w+|[-+]?\d[\d_]*\.?\d*(?:e[-+]?\d+)?)(?![\w.])"
+)
 LOOK_AHEAD = 40  # lines of one value
 NEAR, NEAR_NAME = 0.75, 0.6  # of a key, and of the name of a map or a transport
 NETWORK = ("tcp", "rtu_tcp")  # transports that have a host
@@ -111,7 +114,8 @@ def _read(
             drive_map = _map_of(row, folder, axis_faults)
         except Exception as error:  # any fault of a map costs its own axis alone
             drive_map = None
-            axis_faults.append(f"its map cannot be read: {error}")
+            reason = getattr(error, "strerror", None) or error
+            axis_faults.append(f"its map cannot be read: {reason}")
         faults += [f"{name}: {fault}" for fault in axis_faults]
         if not unit or drive_map is None:
             lost.append((name, unit))
@@ -175,15 +179,18 @@ def _map_of(
         near = difflib.get_close_matches(path.stem, names, 1, NEAR_NAME)
         tried = f"; trying {near[0]}" if near else ""
         faults.append(f"no map {name}{tried}")
-        path = MAP_FOLDER / f"{near[0]}.toml" if near else path
+        if not near:
+            return None
+        path = MAP_FOLDER / f"{near[0]}.toml"
     return map_of(_decoded(path.read_bytes()), path.parent, faults)
 
 
 def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace | None:
     """What of a map stops its drives and sees them stand; None where it cannot."""
     data = tables_of(text, faults)
+    drive = str(data.get("drive"))
     drive_map = SimpleNamespace(
-        name=str(data.get("name", "map")), drive=str(data.get("drive", "modbus")),
+        name=str(data.get("name", "map")), drive=drive if ":" in drive else "modbus",
         folder=folder, text=text, settings=data.get("settings", {}),
         restart_s=_number(data.get("restart_s", 2.0), 2.0, 2.0, 60, "restart_s", []),
         inter_frame_s=_number(data.get("inter_frame_s", 0), 0.0, 0, 1, "silence", []),
@@ -227,11 +234,15 @@ def _frames(table: Any) -> Frames | None:
     try:
         frames = []
         for row in rows:
-            words = tuple(word_of(word) for word in row["words"])
+            listed = row["words"] if isinstance(row["words"], list) else [row["words"]]
+            numbers = [_register(word) for word in listed]
+            pairs = zip(listed, numbers, strict=True)
+            words = tuple(word_of(w if n is None else n) for w, n in pairs)
             function = row.get("function")
             if count_of(words) > 1 or function not in (5, 6, 16):
                 function = 6 if count_of(words) == 1 else 16
-            address = int(_number(row["address"], 0, 0, 0xFFFF, "address", []))
+            if (address := _register(row["address"])) is None:
+                return None
             frames.append(Frame(address=address, words=words, function=function))
     except (KeyError, TypeError, ValueError):
         return None
@@ -239,18 +250,25 @@ def _frames(table: Any) -> Frames | None:
 
 
 def _value(table: Any, kind: str) -> Place | None:
-    if not isinstance(table, dict) or type(table.get("address")) is not int:
+    address = _register(table.get("address")) if isinstance(table, dict) else None
+    if address is None:
         return None
     kind = str(table.get("type", kind))
     if kind not in FORMATS:
         return None
     function, bits = table.get("function"), table.get("bits")
     return Place(
-        address=table["address"], type=kind,
+        address=address, type=kind,
         function=function if function in range(1, 5) else 3,
         bits=bits if bits in range(65) else 0,
         counts=_number(table.get("counts", 1.0), 1.0, 1e-12, 1e12, "counts", []),
     )  # fmt: skip
+
+
+def _register(value: Any) -> int | None:
+    """An address or a word, also as text."""
+    number = int(_number(value, -1, 0, 0xFFFF, "register", []))
+    return number if number >= 0 else None
 
 
 def _bits(table: Any) -> Bits | None:
@@ -284,11 +302,13 @@ def _near(table: dict[str, Any], name: str) -> Any:
 def _number(
     value: Any, default: float, low: float, high: float, name: str, faults: Faults
 ) -> float:
+    """The one number of a value, which may be in a text or a list."""
     try:
-        number = float(value if type(value) is not bool else "true")
+        words = NUMBER.findall(str(value))
+        (number,) = {float(int(w, 16) if w[:2] in ("0x", "0X") else w) for w in words}
         if low <= number <= high and (isinstance(default, float) or number % 1 == 0):
             return number
-    except (TypeError, ValueError):
+    except ValueError:
         pass
     used = f"; using {default:g}" if default else ""
     faults.append(f"{name}: not a number in [{low:g}, {high:g}], {value!r}{used}")

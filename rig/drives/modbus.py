@@ -67,6 +67,10 @@ class ModbusDrive(Drive):
         self.write(self.map.enable)
 
     def look(self, retries: int) -> Look:
+        if not (self.map.status and self.map.position):  # a stop has read what it could
+            raise BusError(
+                f"the map {self.map.name} has no readable [status], [position]"
+            )
         word = self.read(self.map.status, retries)
         count = self.read(self.map.position, retries)
         return Look(position=count, **self.map.status.flags(word), word=word)
