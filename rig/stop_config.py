@@ -1,7 +1,8 @@
 """What a stop, or who moves drives, needs of rig.toml: bus, units and maps of axes.
 
-Of a file that is not TOML every line counts that can be read. A value that is none is
-replaced by its default, a name by the nearest there is; the rest is told.
+Of a file that is not TOML every line counts that can be read, the first value of a key.
+A value that is none is replaced by its default, a name by the nearest there is, a map
+that is missing by that of all others; what looks like an axis is one, or told as lost.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import difflib
 import pathlib
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,12 +21,24 @@ from rig.registers import FLAGS, FORMATS, Bits, Flags, Frame, Frames, Place, wor
 from rig.registers import registers_in as count_of
 
 MAP_FOLDER = pathlib.Path(__file__).parent / "maps"
-HEADER = re.compile(r"\s*\[+\s*([A-Za-z_][\w.\s\"'-]*?)[^\w\"']*(#.*)?")
-ASSIGNMENT = re.compile(r"\s*([\w-]+)\s*[=:]\s*(.+?)\s*(#.*)?")
+HEADER = re.compile(
+    r"\s*([\[({][\[({\s]*)?([\"']?[A-Za-z_][\w.\"'-]*)\s*([\])}][\])}\s]*)?"
+    r"((?![=:,]).*)"
+)
+ASSIGNMENT = re.compile(
+    r"([A-Za-z_][\w-]*)[\"']?\s*[=:]+\s*(\"[^\"]*\"|'[^']*'|[^,;#]+?)"
+    r"\s*(?=[,;#}]|$|\s[\w-]+\s*=)"
+)
+NOTE = re.compile(r"\s*(;|//)")  # as other formats have them
+QUOTES = dict.fromkeys(
+    map(ord, "\u201c\u201d\u201e\u201f\u2018\u2019\u201a\u00ab\u00bb"), '"'
+)
 NUMBER = re.compile(
     r"(?<![\w.])(?:0[xX]\w+|[-+]?\d[\d_]*\.?\d*(?:e[-+]?\d+)?)(?![\w.])"
 )
 LOOK_AHEAD = 40  # lines of one value
+SENSORS = ("imu", "readings")  # tables with a host of their own
+DEEP = 3  # tables inside tables that are looked at
 NEAR, NEAR_NAME = 0.75, 0.6  # of a key, and of the name of a map or a transport
 NETWORK = ("tcp", "rtu_tcp")  # transports that have a host
 TRANSPORTS = (*NETWORK, "rtu", "serial", "can")
@@ -33,6 +46,10 @@ RANGES = {
     "port": (1, 65535), "baudrate": (1200, 3_000_000), "stopbits": (1, 2),
     "bytesize": (7, 8), "timeout_s": (0.01, 5), "read_retries": (0, 10),
 }  # fmt: skip
+AXIS = (
+    "unit", "map", "min_deg", "max_deg", "pulses_per_rev", "reduction", "rotates",
+    "speed_deg_s", "accel_deg_s2",
+)  # fmt: skip
 FRAMES = (  # of a map, besides its stop
     "move", "home", "hold", "enable", "alarm_reset", "comm_timeout", "limits",
     "set_zero",
@@ -85,33 +102,37 @@ def read_file(path: pathlib.Path) -> StopConfig:
     """All that is of use in a configuration file; OSError where it cannot be opened."""
     faults: Faults = []
     data = tables_of(_decoded(path.read_bytes()), faults)
-    return _read(data, rows_of(_near(data, "axes")), path.parent, faults)
+    return _read(_bus_table(data), _axes_of(data), path.parent, faults)
 
 
 def read_armed(armed: dict[str, Any]) -> StopConfig:
     """All that is of use in what a session left beside its lock."""
-    return _read(armed, rows_of(armed.get("drives")), None, [])
+    return _read(armed.get("bus"), rows_of(armed.get("drives")), None, [])
 
 
 def _read(
-    data: dict[str, Any],
+    bus_table: Any,
     rows: list[dict[str, Any]],
     folder: pathlib.Path | None,
     faults: Faults,
 ) -> StopConfig:
     bus_faults: Faults = []
-    bus = bus_of(_near(data, "bus"), bus_faults)
+    bus = bus_of(bus_table, bus_faults)
     axes: list[SimpleNamespace] = []
     lost: list[tuple[str, int]] = []
+    map_names = [_near(row, "map") for row in rows]
+    maps = {name for name in map_names if isinstance(name, str) and name.strip()}
     for number, row in enumerate(rows, 1):
         axis_faults: Faults = []
         name = _near(row, "name")
         if not isinstance(name, str):
             axis_faults.append("it has no name")
             name = f"axis {number}"
-        unit = int(_number(_near(row, "unit"), 0, 1, 247, "unit", axis_faults))
+        unit_value = _near(row, "unit")
+        unit_value = row.get("id") if unit_value is None else unit_value
+        unit = int(_number(unit_value, 0, 1, 247, "unit", axis_faults))
         try:
-            drive_map = _map_of(row, folder, axis_faults)
+            drive_map = _map_of(row, maps, folder, axis_faults)
         except Exception as error:  # any fault of a map costs its own axis alone
             drive_map = None
             reason = getattr(error, "strerror", None) or error
@@ -148,6 +169,10 @@ def bus_of(table: Any, faults: Faults) -> Bus | None:
             value = _number(value, default, low, high, f"bus.{field.name}", faults)
             value = type(default)(value)
         setattr(bus, field.name, value)
+    host = re.fullmatch(r"(?:\w+://)?([^/:]+)(?::(\d+))?/*", bus.host)
+    if host and host[2] and _near(table, "port") is None:
+        bus.port = int(_number(host[2], 502, 1, 65535, "bus.host", faults))
+    bus.host = host[1] if host else bus.host
     bus.parity = bus.parity[:1].upper() if bus.parity[:1].upper() in "NEO" else "N"
     fault = "" if bus.transport in TRANSPORTS else f"not one of {', '.join(TRANSPORTS)}"
     word = bus.transport.lower()
@@ -165,12 +190,15 @@ def bus_of(table: Any, faults: Faults) -> Bus | None:
 
 
 def _map_of(
-    row: dict[str, Any], folder: pathlib.Path | None, faults: Faults
+    row: dict[str, Any], maps: set[str], folder: pathlib.Path | None, faults: Faults
 ) -> SimpleNamespace | None:
     name = _near(row, "map")
-    if not isinstance(name, str) or not name:
-        faults.append("it has no map")
-        return None
+    if not isinstance(name, str) or not name.strip():
+        tried = "; trying that of the others" if len(maps) == 1 else ""
+        faults.append(f"it has no map{tried}")
+        if not tried:
+            return None
+        (name,) = maps
     if folder is None:
         return map_of(name, pathlib.Path(str(row.get("folder", ""))), faults)
     path = folder / name if name.endswith(".toml") else MAP_FOLDER / f"{name}.toml"
@@ -311,52 +339,138 @@ def _number(
     except ValueError:
         pass
     used = f"; using {default:g}" if default else ""
-    faults.append(f"{name}: not a number in [{low:g}, {high:g}], {value!r}{used}")
+    faults.append(f"{name}: not a number in [{low:g}, {high:g}], {value!r:.60}{used}")
     return default
 
 
 def _decoded(data: bytes) -> str:
+    """Text in UTF-8, 16 or 32, of which the zeros are left out."""
     utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-    return data.decode("utf-16" if utf16 else "utf-8-sig", errors="replace")
+    text = data.decode("utf-16" if utf16 else "utf-8-sig", errors="replace")
+    return text.replace("\0", "")
 
 
 def tables_of(text: str, faults: Faults) -> dict[str, Any]:
     """A TOML text; of one that is broken all lines that can be read."""
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         faults.append(f"not valid TOML: {error}")
+    text = re.sub(r",(\s*})", r"\1", text.translate(QUOTES))
     root: dict[str, Any] = {}
     table, lines = root, text.splitlines()
     while lines:
-        values: dict[str, Any] = {}
-        count = 1
-        if header := HEADER.fullmatch(lines[0]):
-            *path, last = (part.strip(" \"'") for part in header[1].split("."))
+        header = HEADER.fullmatch(lines[0])
+        if header and ("[" in (header[1] or "") or header[3]):
+            *path, last = (part for part in re.split(r"[\s.\"']+", header[2]) if part)
             table = root
             for part in path:
                 table = _inner(table, part)
-            if lines[0].lstrip().startswith("[[") or last == "axes":
+            if (header[1] or "").count("[") > 1 or _called(last, "axes"):
                 table[last] = [*rows_of(table.get(last)), {}]
             table = _inner(table, last)
-        else:
-            values, count = _first_value(lines)
-        table.update(values)
+            lines[0] = header[4]
+        values, count = _first_values(lines)
+        for key, value in values:
+            table = _added(root, table, key, value)
         del lines[:count]
     return root
 
 
+def _added(
+    root: dict[str, Any], table: dict[str, Any], key: str, value: Any
+) -> dict[str, Any]:
+    """Add a value where the first of its key counts. The table that goes on: a second
+    name, unit or map begins another axis, a second transport another section."""
+    old = table.get(key)
+    if isinstance(value, str) and value[:1] in ("[", "{"):
+        for name in (name for name in ("axes", "bus") if _called(key, name)):
+            root[name] = [*rows_of(root.get(name)), {}]  # a list or table with a fault
+            return _inner(root, name)
+    if isinstance(old, dict) and isinstance(value, dict):
+        for inner_key, inner_value in value.items():
+            _added(root, old, inner_key, inner_value)
+    elif not old:
+        table[key] = value
+    elif key == "transport" and value != old:
+        return _inner(root, "bus" if _is_transport(value) else "imu")
+    elif key in ("name", "unit", "map") and value != old and _axis_keys(table):
+        if _unit_of(value) if key == "unit" else value and isinstance(value, str):
+            root["axes"] = [*rows_of(root.get("axes")), {key: value}]
+            return _inner(root, "axes")
+    return table
+
+
 def _inner(table: dict[str, Any], name: str) -> dict[str, Any]:
     """The table of a name, or the last of several, made where there is none."""
-    return (rows_of(table.setdefault(name, {})) or [{}])[-1]
+    if not rows_of(table.get(name)):
+        table[name] = {}
+    return rows_of(table[name])[-1]
 
 
-def _first_value(lines: Sequence[str]) -> tuple[dict[str, Any], int]:
+def _first_values(lines: Sequence[str]) -> tuple[list[tuple[str, Any]], int]:
     """What the first lines say, and how many they are."""
     for count in range(1, min(len(lines), LOOK_AHEAD) + 1):
         try:
-            return tomllib.loads("\n".join(lines[:count])), count
-        except tomllib.TOMLDecodeError:
+            return [*tomllib.loads("\n".join(lines[:count])).items()], count
+        except (ValueError, RecursionError):
             continue
-    broken = ASSIGNMENT.fullmatch(lines[0])
-    return ({broken[1]: broken[2].strip(" \"'")} if broken else {}), 1
+    pairs = ASSIGNMENT.findall("" if NOTE.match(lines[0]) else lines[0])
+    return [(key, value.strip(" \"'\ufffd")) for key, value in pairs], 1
+
+
+def _tables(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[Any, Any]]:
+    """Every table that is not deep inside, after the names on the way to it."""
+    for table in rows_of(value):
+        yield path, table
+        for key in table if len(path) < DEEP else ():
+            yield from _tables(table[key], (*path, key))
+
+
+def _called(key: str, name: str) -> bool:
+    word = key.lower()
+    return name in word or bool(difflib.get_close_matches(name, [word], 1, NEAR))
+
+
+def _axis_keys(table: dict[str, Any]) -> set[str]:
+    """The keys that only an axis has; the unit of numbers or angles is none."""
+    return {
+        key for key in AXIS if key in table and (key != "unit" or _unit_of(table[key]))
+    }
+
+
+def _axes_of(data: dict[str, Any]) -> list[dict[str, Any]]:
+    """Every table that is called an axis, or looks like one."""
+    rows = []
+    for path, table in _tables(data):
+        keys = _axis_keys(table)
+        if any(_called(part, "axes") for part in path):
+            inner = table and all(isinstance(value, dict) for value in table.values())
+            keys |= set() if inner else {"map"}
+        elif path and _called(path[0], "readings"):  # registers of a sensor have a unit
+            keys -= {"unit"}
+        rows += [table] * bool(keys)
+    return rows
+
+
+def _bus_table(data: dict[str, Any]) -> dict[str, Any]:
+    """The first value of each key of tables called bus, else of one that says where."""
+    tables = [(path[-1] if path else "", table) for path, table in _tables(data)
+              if not any(_called(path[0], n) for n in SENSORS if path)]  # fmt: skip
+    bus: dict[str, Any] = {}
+    for table in [table for name, table in tables if _called(name, "bus")]:
+        bus |= {key: table[key] for key in table if not bus.get(key)}
+    places = [t for _, t in tables if _is_transport(_near(t, "transport"))]
+    return next((t for t in (bus, *places) if _place_of(t)), bus)
+
+
+def _place_of(table: dict[str, Any]) -> Any:
+    return _near(table, "host") or _near(table, "device")
+
+
+def _is_transport(value: Any) -> bool:
+    return bool(difflib.get_close_matches(str(value).lower(), TRANSPORTS, 1, NEAR_NAME))
+
+
+def _unit_of(value: Any) -> int:
+    return int(_number(value, 0, 1, 247, "unit", []))

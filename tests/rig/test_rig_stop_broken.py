@@ -104,6 +104,12 @@ WHOLE = {
     "single brackets": lambda text: text.replace("[[axes]]", "[axes]"),
     "a near name of a map": replaced(MAP, 'map = "leadshine-pr"'),
     "a near key": replaced("unit = 1\n", "units = 1\n"),
+    "no map": replaced(MAP + "\n", ""),
+    "a number for a map": replaced(MAP, "map = 3"),
+    "no header of an axis": replaced("[[axes]]\n", ""),
+    "another header of an axis": replaced("[[axes]]", "[[axis]]"),
+    "no header of the bus": replaced("[bus]\n", ""),
+    "a value that is too long": replaced("min_deg = -20", "min_deg = " + "9" * 5000),
     "capitals": replaced("[bus]", "[BUS]"),
     "windows": lambda text: text.replace("\n", "\r\n"),
     "a control character": replaced("[imu]", "[imu]\n# \0 \x07"),
@@ -113,10 +119,8 @@ WHOLE = {
 OTHERS = {  # and which cannot
     "a unit that is none": (replaced("unit = 1\n", "unit = 900\n"), "pitch"),
     "no unit": (replaced("unit = 1\n", ""), "pitch"),
-    "no map": (replaced(MAP + "\n", ""), "pitch"),
     "a missing map": (replaced(MAP, 'map = "own.toml"'), "pitch"),
     "a map of another planet": (replaced(MAP, 'map = "zorg"'), "pitch"),
-    "a number for a map": (replaced(MAP, "map = 3"), "pitch"),
     "a class that is none": (replaced(MAP, 'map = "bad.toml"'), "pitch"),
 }
 
