@@ -206,8 +206,8 @@ def _say(text: str) -> None:
 
 
 def stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
-    """Stop the drives that were armed last, else those of the configuration file, once
-    who was asked to has been waited for. ``stay``: look whether they stay, too."""
+    """Stop the drives that are armed and those of the configuration file, once who was
+    asked to has been waited for. ``stay``: look whether they stay, too."""
     from rig.core import stop
 
     target.end()
@@ -246,7 +246,7 @@ def stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
 
 def _drives(target: ArmedBus) -> tuple[Any, float, list[Any], list[UnitStop]]:
     """Bus, silence, axes that can be stopped (Fault: none can), and those that cannot:
-    of what is armed, else of the file, else as armed last; each helps the others."""
+    of what is armed and of the file, else of the file, which the last record helps."""
     from rig.core.stop import UnitStop
 
     armed = config_of(target.armed) if target.armed else None
@@ -259,10 +259,11 @@ def _drives(target: ArmedBus) -> tuple[Any, float, list[Any], list[UnitStop]]:
     axes: list[Any] = []
     lost: dict[str, UnitStop] = {}
     for source in sources:
-        first, units = not axes, [axis.unit for axis in axes]
+        names, units = [axis.name for axis in axes], [axis.unit for axis in axes]
+        first = not axes
         axis: Any
         for axis in source.axes:
-            if not first and axis.name not in lost:
+            if not (first or target.moves or axis.name in lost):
                 continue
             lost.pop(axis.name, None)
             try:
@@ -271,9 +272,10 @@ def _drives(target: ArmedBus) -> tuple[Any, float, list[Any], list[UnitStop]]:
                     axes.append(axis)
             except Refused as error:
                 lost[axis.name] = UnitStop(axis.name, axis.unit, detail=str(error))
-        for name, unit in source.lost if first else ():
-            text = "the way to stop it cannot be read"
-            lost[name] = UnitStop(name, unit, detail=text)
+        for name, unit in source.lost if first or target.moves else ():
+            if name not in names and unit not in units:
+                text = "the way to stop it cannot be read"
+                lost[name] = UnitStop(name, unit, detail=text)
     if not axes:
         faults = [fault for source in sources for fault in source.faults]
         reason = "; ".join(faults) or "neither the file nor a session names an axis"

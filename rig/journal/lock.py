@@ -199,7 +199,7 @@ def read_armed(path: pathlib.Path) -> dict[str, Any] | None:
         told = json.loads(path.read_text(encoding="utf-8"))
         useful = told["bus"] and told["drives"]
         return {"standing": False, **told} if useful else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 

@@ -187,6 +187,31 @@ def _lock_of(rig):
     return BusLock(load_config(rig.path).bus)
 
 
+@pytest.mark.parametrize("units", [[1, 2], [4, 5], [1, 2, 3]])
+def test_what_is_armed_and_what_the_file_names_are_stopped(units, rig, capsys):
+    """A record of another day that was not ended does not win over the file."""
+    _armed(rig)
+    path = _lock_of(rig).armed_path
+    told = json.loads(path.read_text())
+    told["drives"] = [
+        {**drive, "unit": unit}
+        for unit, drive in zip(units, told["drives"], strict=False)
+    ]
+    path.write_text(json.dumps(told))
+    code = main(["stop", "--config", str(rig.path)])
+    said = capsys.readouterr().out
+    assert stopped(rig) == ALL
+    assert code == (3 if 4 in units else 0), said
+    assert all(f"(unit {unit}): " in said for unit in {*units, 1, 2, 3})
+
+
+def test_a_record_that_is_nested_too_deep_is_none(rig, folder):
+    folder.mkdir(mode=0o700)
+    _lock_of(rig).armed_path.write_text("[" * 100_000)
+    assert main(["stop", "--config", str(rig.path)]) == 0
+    assert stopped(rig) == ALL
+
+
 @pytest.mark.parametrize("spoil", ["file", "garbage", "directory", "link", "mode"])
 def test_a_lock_that_cannot_be_read_does_not_keep_it(spoil, rig, folder):
     path = _lock_of(rig).path
