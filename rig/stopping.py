@@ -144,6 +144,7 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
 def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
     """The buses to stop; what is wrong with the file is said. Fault: there are none."""
     targets: list[ArmedBus] = []
+    path = path / FILE if path.is_dir() else path
     try:
         config = read_file(path)
         lack = "; ".join(config.bus_faults)

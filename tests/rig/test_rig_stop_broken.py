@@ -212,6 +212,11 @@ def test_a_record_that_is_nested_too_deep_is_none(rig, folder):
     assert stopped(rig) == ALL
 
 
+def test_the_folder_of_the_file_is_taken_for_it(rig):
+    assert main(["stop", "--config", str(rig.path.parent)]) == 0
+    assert stopped(rig) == ALL
+
+
 @pytest.mark.parametrize("spoil", ["file", "garbage", "directory", "link", "mode"])
 def test_a_lock_that_cannot_be_read_does_not_keep_it(spoil, rig, folder):
     path = _lock_of(rig).path
