@@ -281,6 +281,16 @@ def test_a_sensor_at_the_end_of_its_range_is_told(low, high):
             assert "range?" not in str(coarse), seed
 
 
+def test_two_rows_from_elsewhere_are_told_beside_a_nearer_one():
+    """Row 11 is off by less than six times the noise, rows 8 and 9 by over twenty."""
+    rng = np.random.default_rng(18)
+    u = rng.uniform(-20.0, 20.0, (20, 2))
+    y = u @ [[1.3], [1.2]] + 2.0
+    y[8:12] = rng.uniform(y.min(), y.max(), (4, 1))
+    verdict = _verdict(u, y + rng.normal(0.0, 1.7, y.shape)).verdict
+    assert not verdict.good and "Rows 8, 9 are outliers" in verdict.reasons[0]
+
+
 def test_one_output_that_was_sorted_is_told():
     for seed in range(10):
         u, y = _table(seed)

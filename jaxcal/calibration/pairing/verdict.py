@@ -80,10 +80,11 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
         return None  # what was stated is too small for the others too
     readings = (table.measured / table.scale)[rows]
     away = np.abs(readings - predicted(table, plain)[rows]) / plain.noise
-    least = float(away.max(axis=1).min())
-    benign = max(other.evidence for other in benign_fits(table, plain, plain))
-    if least < _OFF or benign > plain.evidence:
+    away, benign = away.max(axis=1), benign_fits(table, plain, plain)
+    rows = rows[away >= _OFF]
+    if not len(rows) or max(x.evidence for x in benign) > plain.evidence:
         return None
+    least = float(away[away >= _OFF].min())
     named = in_rows([*map(int, rows)])
     verb = "are outliers" if len(rows) > 1 else "is an outlier"
     noise = f"{in_words(plain.noise * table.scale)} {fit.measured_unit}".strip()
