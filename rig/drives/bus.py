@@ -67,6 +67,8 @@ class Bus(Line):
         self.listen_s = LISTEN_S
         self._client = Wire(settings)
         self._spare: Wire | None = None  # a second connection, of a stop
+        self._alone = False  # the gateway gives no second one
+        self._wire_of: dict[int, Wire] = {}  # to ask a unit over next
         self._doubted: set[int] = set()  # whose acknowledgement may be an echo
 
     def connect(self) -> None:
@@ -84,7 +86,7 @@ class Bus(Line):
         with self._lock:
             for wire in filter(None, (self._client, self._spare)):
                 wire.close()
-            self._client, self._spare = Wire(self.settings), None
+            self._client, self._spare, self._alone = Wire(self.settings), None, False
 
     @property
     def echoes(self) -> bool:
@@ -295,26 +297,38 @@ class Bus(Line):
         """The PDU of the reply to a request that is sent once."""
         if (silent_s := self._quiet_until - time.monotonic()) > 0.0:
             time.sleep(silent_s)  # sleep(0) takes .1 ms as well
+        self._choose_connection(unit)
         self.open()  # connecting, where it is lost, may take as long as configured
-        if self._urgent and self._spare is None and self._client.owes:
-            self._add_connection()
         pdu = bytes([function]) + data
+        if not self._urgent:
+            self._client.ask_only(bytes([unit]) + pdu)
         try:
             return self._client.exchange(unit, pdu, self._timeout_s, answered)
-        except BusError:
-            if self._spare is not None:  # by turns, so that each unit has both
-                self._client, self._spare = self._spare, self._client
-            raise
+        except BusError as error:
+            if self._spare is None:
+                raise
+            self._client, self._spare = self._spare, self._client
+            if not error.lost:
+                raise
+            self._spare, self._alone = None, True  # the other has no second chance
+            if not self._urgent:
+                raise
+            return self._client.exchange(unit, pdu, self._timeout_s, answered)
         finally:
+            self._wire_of[unit] = self._client  # each unit has both by turns
             self._quiet_until = time.monotonic() + self.silence_s
 
-    def _add_connection(self) -> None:
-        """A second one for a stop, where a gateway is busy with what came before over
-        the first, and gives one; the first is kept."""
-        self._spare = Wire(self.settings)
-        with contextlib.suppress(Exception):  # it gives none
-            self._spare.open()
+    def _choose_connection(self, unit: int) -> None:
+        """The one of two that a unit has answered over, or was not asked over last. A
+        stop asks for a second where a gateway may be busy over the first."""
+        if self._spare is not None and self._spare is self._wire_of.get(unit):
             self._client, self._spare = self._spare, self._client
+        elif self._urgent and not (self._spare or self._alone) and self._client.owes:
+            self._alone = True
+            second = Wire(self.settings)
+            with contextlib.suppress(Exception):  # it gives none
+                second.open()
+                self._client, self._spare, self._alone = second, self._client, False
 
     def _resynchronise(self, unit: int, function: int, owed: int) -> None:
         """Empty an RTU line; a reply of ``owed`` bytes may still come."""

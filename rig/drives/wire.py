@@ -1,7 +1,7 @@
 """Modbus frames on one connection: numbered over TCP; with a CRC on a serial port, or
 through a socket.
 
-A late reply over TCP is dropped by its number and the connection kept, since a gateway
+A late reply over TCP is known by its number and the connection kept, since a gateway
 may give no other for seconds. It serves one request after the other, so the same is
 asked but a few times: little stands in the way of a stop. A reply of RTU is looked for
 in all that came, past an adapter's echo and noise."""
@@ -13,6 +13,7 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from rig.drives.line import BusError
@@ -64,11 +65,14 @@ class Wire:
         self._numbered = settings.transport == "tcp"
         self._is_socket = settings.transport != "rtu"
         self._number = time.time_ns() & 0xFFFF
-        self._asked = b""  # the last request, without a number,
+        # Of a request, without a number: those it was sent under; and its reply, where
+        # that came while another was asked.
+        self._accepted: dict[bytes, set[int]] = {}
+        self._kept: dict[bytes, bytes] = {}
         self._unanswered: dict[int, float] = {}  # numbers, and when they were sent
-        self._missed: dict[int, int] = {}  # units of RTU that owe a reply: its function
-        self.late: set[int] = set()  # units whose reply came after its time
-        self._accepted: set[int] = set()  # those of the last request
+        # Units of RTU that owe a reply: its function, and when it was asked for.
+        self._missed: dict[int, tuple[int, float]] = {}
+        self.late: set[int] = set()  # units whose reply came after bus.timeout_s
         self._came = b""  # over TCP, and not looked at yet
         self.noise = ""  # what came last that was no reply, in hex
 
@@ -77,8 +81,9 @@ class Wire:
         s = self.settings
         if self.socket is not None:
             return
-        self._came, self._asked = b"", b""
-        self._unanswered.clear()
+        self._came = b""
+        for of_before in (self._accepted, self._kept, self._unanswered):
+            of_before.clear()
         if self._is_socket:
             made = socket.create_connection((s.host, s.port), s.timeout_s)
             made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -129,15 +134,15 @@ class Wire:
             frame += crc16(frame)
         if frame:
             (self.socket.sendall if self._is_socket else self.socket.write)(frame)
-        end, came, late = time.monotonic() + timeout_s, b"", 0
+        begun, came = time.monotonic(), b""
         while answered:
-            wait_s = end - time.monotonic()
-            data = self._read(max(0.0, wait_s))
+            wait_s = begun + timeout_s - time.monotonic()
+            kept = bytes([unit]) + pdu in self._kept
+            data = self._read(0.0 if kept else max(0.0, wait_s))
             came += data
             if self._numbered:
                 self._came += data
-                reply, dropped = self._numbered_reply(unit)
-                late += dropped
+                reply = self._numbered_reply(bytes([unit]) + pdu)
             else:
                 reply = self._reply_beside_echo(came, frame)
             if reply is not None:
@@ -148,11 +153,9 @@ class Wire:
                     came = came[len(frame) :]
                 self._look_for_late(came)
                 if not self._numbered:
-                    self._missed[unit] = pdu[0]
-                if late:
-                    self.late.add(unit)
-                is_late, begun = unit in self.late, bytes([unit, pdu[0]])
-                why = self._why(came, timeout_s, is_late, begun)
+                    self._missed[unit] = pdu[0], begun
+                is_late = unit in self.late
+                why = self._why(came, timeout_s, is_late, bytes([unit, pdu[0]]))
                 error = BusError(f"unit {unit}: no valid reply ({why})")
                 error.advice = LATER if is_late else error.advice
                 raise error
@@ -160,10 +163,15 @@ class Wire:
 
     def _look_for_late(self, came: bytes, but: int | None = None) -> None:
         """Note units of RTU whose reply is in what came after its time."""
-        for unit, function in list(self._missed.items()) if came else ():
+        for unit, (function, sent) in list(self._missed.items()) if came else ():
             if unit != but and rtu_reply(came, unit, function) is not None:
-                self.late.add(unit)
+                self._note_late(unit, sent)
                 del self._missed[unit]
+
+    def _note_late(self, unit: int, sent: float) -> None:
+        """A stop waits less than configured: what came after that alone is late."""
+        if time.monotonic() - sent > self.settings.timeout_s:
+            self.late.add(unit)
 
     def listen(self, unit: int, seconds: float) -> bool:
         """Wait for a reply of a unit after its time; whether one came."""
@@ -175,15 +183,15 @@ class Wire:
                 self._look_for_late(came)
                 continue
             self._came += data
-            if self._numbered_reply(unit)[0] is not None:
-                self.late.add(unit)
+            self._numbered_reply(bytes([unit]))
         return unit in self.late
 
     def _why(
         self, came: bytes, timeout_s: float, late: bool = False, begun: bytes = b"\0"
     ) -> str:
         if late:
-            return f"late by over {timeout_s:g} s, like others: raise bus.timeout_s"
+            waited_s = self.settings.timeout_s
+            return f"late by over {waited_s:g} s, like others: raise bus.timeout_s"
         if not came:
             return f"no reply within {timeout_s:g} s"
         if not self._numbered and came.startswith(begun):
@@ -195,25 +203,40 @@ class Wire:
     @property
     def owes(self) -> bool:
         """Whether a gateway may be busy with requests of before."""
+        return self._owes(self._unanswered)
+
+    def _owes(self, numbers: Iterable[int]) -> bool:
         recent = time.monotonic() - OWED_S
-        return any(sent > recent for sent in self._unanswered.values())
+        return any(self._unanswered.get(number, 0.0) > recent for number in numbers)
+
+    def ask_only(self, request: bytes) -> None:
+        """Take no reply to another, and none that came before."""
+        self._kept.clear()
+        self._forget(lambda other: other != request)
+
+    def _forget(self, which: Callable[[bytes], bool]) -> None:
+        for request in filter(which, [*self._accepted]):
+            del self._accepted[request]
+            self._kept.pop(request, None)
 
     def _numbered_request(self, request: bytes) -> bytes:
-        """A frame to send; empty where the same was sent often enough, since the answer
-        to any number of one request is its answer."""
-        if request != self._asked:
-            self._asked, self._accepted = request, set()
-        elif len(self._accepted) >= MOST_UNANSWERED and self.owes:
+        """A frame to send; empty where the same was sent often enough, or is answered
+        since: the answer to any number of one request is its answer."""
+        if request[1] in WRITES and request not in self._accepted:
+            self._forget(lambda other: other[0] == request[0])  # it was before
+        accepted = self._accepted.setdefault(request, set())
+        often = len(accepted) >= MOST_UNANSWERED and self._owes(accepted)
+        if often or request in self._kept:
             return b""
         self._number = self._number + 1 & 0xFFFF
-        self._accepted.add(self._number)
+        accepted.add(self._number)
         self._unanswered[self._number] = time.monotonic()
         return struct.pack(">HHH", self._number, 0, len(request)) + request
 
-    def _numbered_reply(self, unit: int) -> tuple[bytes | None, int]:
-        """The reply to the last request, and how many replies to others it passed."""
-        late = 0
-        while len(self._came) > 7:
+    def _numbered_reply(self, asked: bytes) -> bytes | None:
+        """The reply to a request; those to others are kept for them."""
+        unit = asked[0]
+        while len(self._came) > 7 and asked not in self._kept:
             number, protocol, size, sender = struct.unpack_from(">HHHB", self._came)
             age = self._number - number & 0xFFFF
             if protocol or not 3 <= size <= 254 or age > OLDEST:
@@ -226,15 +249,17 @@ class Wire:
             if len(self._came) < 6 + size:
                 break
             reply, self._came = self._came[7 : 6 + size], self._came[6 + size :]
-            self._unanswered.pop(number, None)
-            if number not in self._accepted:
-                late += 1
-                continue
-            self._asked = b""
-            if sender != unit:
-                raise BusError(f"unit {unit}: another unit replied, {sender}")
-            return reply, late
-        return None, late
+            self._note_late(sender, self._unanswered.pop(number, time.monotonic()))
+            for request, accepted in self._accepted.items():
+                if number in accepted and request[0] == sender:
+                    self._kept[request] = reply
+                elif number in accepted and request == asked:
+                    del self._accepted[asked]
+                    raise BusError(f"unit {unit}: another unit replied, {sender}")
+        if asked not in self._kept:
+            return None
+        del self._accepted[asked]  # asked again it is another request
+        return self._kept.pop(asked)
 
     def _reply_beside_echo(self, came: bytes, request: bytes) -> bytes | None:
         """The reply of an RTU line. That to function 5 or 6 repeats its request."""
