@@ -222,12 +222,14 @@ def stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
         stack.callback(line.close)
         named = ", ".join(f"{axis.name} (unit {axis.unit})" for axis in axes)
         _say(f"stopping {named} on {target.lock.where}")
-        again = target.holder is not None or target.moves
-        end = time.monotonic() + REOPEN_S * again
+        again = target.holder is not None or target.moves or bus.host
+        end = time.monotonic() + REOPEN_S * bool(again)
         while True:
             try:
                 line.open()
                 results = stop.stop_all(drives)
+                if all(unit.unsent for unit in results):
+                    raise BusError(results[0].detail)
                 reached = any(unit.acknowledged or unit.standing for unit in results)
                 if reached or time.monotonic() > end:
                     break

@@ -27,9 +27,11 @@ class UnitStop:
     detail: str = ""
     position: int | None = None  # pulses, as last read
     stayed: bool = False  # and it stood for longer than it takes to go on by itself
+    unsent: bool = False  # no connection took its stop
 
     def __str__(self) -> str:
-        state = "acknowledged" if self.acknowledged else "NOT acknowledged"
+        state = "NO STOP COULD BE SENT" if self.unsent else "NOT acknowledged"
+        state = "acknowledged" if self.acknowledged else state
         rest = "standing" if self.stayed else "at rest"
         rest = rest if self.standing else "NOT seen standing"
         detail = f" ({self.detail})" if self.detail else ""
@@ -46,7 +48,7 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
     The first round waits a short time for each reply, so that a dead unit delays the
     others little; the next as long as configured. Never raises, never leaves one out.
     """
-    results = [UnitStop(d.axis.name, d.axis.unit) for d in drives]
+    results = [UnitStop(d.axis.name, d.axis.unit, unsent=True) for d in drives]
     if not drives:
         return results
     line, pairs = drives[0].line, list(zip(drives, results, strict=True))
@@ -71,8 +73,9 @@ def _send(pairs: Pairs) -> None:
         if not result.acknowledged:
             try:
                 drive.stop()
-                result.acknowledged, result.detail = True, ""
+                result.acknowledged, result.unsent, result.detail = True, False, ""
             except Exception as error:
+                result.unsent &= getattr(error, "lost", False)
                 result.detail = str(error)
 
 

@@ -3,9 +3,11 @@
 import time
 
 import pytest
-from harness import changed
+from harness import changed, fast_text
 from test_rig_wire import behind_a_gateway, folder  # noqa: F401  # its locks
 
+from rig import stopping
+from rig.__main__ import main
 from rig.core.stop import stop_all
 from rig.drives.bus import Bus
 from rig.drives.modbus import ModbusDrive
@@ -39,3 +41,29 @@ def test_every_unit_gets_its_stop_over_the_only_connection(refuses, fault):
         assert first.acknowledged == (fault != "dead_drive"), first
         assert gateway.given == 1 and all(drive.stops for drive in sim.drives[1:])
         assert gateway.refused <= 2
+
+
+def test_stop_waits_for_a_gateway_though_nothing_was_armed(
+    tmp_path, monkeypatch, capsys
+):
+    """It gave up after 5 s, and did not say that nothing was stopped."""
+    monkeypatch.setattr(stopping, "REOPEN_S", 1.5)
+    with behind_a_gateway() as (sim, gateway, _, config):
+        path = tmp_path / "rig.toml"
+        path.write_text(fast_text({"port = 5020": f"port = {gateway.port}"}))
+        set_moving(sim, config)
+        gateway._free = time.monotonic() + 60.0
+        assert main(["stop", "--config", str(path)]) == 3
+        shown = capsys.readouterr()
+        assert "NOTHING WAS STOPPED BY THIS COMMAND: unit 1: no valid" in shown.err
+        gateway._free = time.monotonic() + 1.0
+        assert main(["stop", "--config", str(path)]) == 0
+        assert all(drive.stops for drive in sim.drives)
+
+
+def test_a_unit_that_no_frame_was_sent_to_is_named():
+    with behind_a_gateway() as (_, gateway, settings, config):
+        gateway._free = time.monotonic() + 60.0
+        with Bus(settings) as bus:
+            results = stop_all([ModbusDrive(bus, axis) for axis in config.axes])
+    assert all("NO STOP COULD BE SENT, NOT seen standing" in str(r) for r in results)
