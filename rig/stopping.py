@@ -13,7 +13,7 @@ import pathlib
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import TYPE_CHECKING, Any
 
@@ -74,17 +74,13 @@ class ArmedBus:
         return self.armed is not None and not self.armed["standing"]
 
     def ask(self) -> None:
-        try:
+        with _helping(f"cannot find out who uses {self.lock.where}"):
             self.holder = self.lock.signal_holder(signal.SIGTERM)
-        except (OSError, Refused) as error:  # the lock is a help, not a condition
-            _say(f"cannot find out who uses {self.lock.where}: {error}")
-        if self.holder is not None:
-            _say(f"{self.lock.where} is {held_by(self.holder)}; asking it to stop")
+            if self.holder is not None:
+                _say(f"{self.lock.where} is {held_by(self.holder)}; asking it to stop")
 
     def end(self) -> None:
         """Wait for the holder; kill one that has not stopped its drives in time."""
-        if self.holder is None:
-            return
         freed = self.lock.freed(ASK_S - (time.monotonic() - self.since))
         if not freed and self._stand:
             freed = self._stayed()
@@ -95,7 +91,10 @@ class ArmedBus:
             if not self.lock.freed(KILLED_S) and not (self._stand and self._stayed()):
                 _say("it still uses the bus")
         reported = "reported that all" if self._stand else "did not report that"
-        _say(f"it {reported} its drives are at rest")
+        if read_armed(self.lock.armed_path):
+            _say(f"it {reported} its drives are at rest")
+        else:
+            _say("it left no word of drives that it armed")
 
     def _stayed(self) -> bool:
         """Wait while it looks whether its drives stay; whether it let go."""
@@ -132,7 +131,8 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
                     _say("\n".join(map(str, job.result())))
                 except Exception as error:  # of one bus: another is stopped
                     faults.append(error)
-        _tell_others(reached)
+        with _helping("cannot look at other devices"):
+            _tell_others(reached)
         if len(faults) == len(jobs):
             raise faults[0]
         for fault in faults:
@@ -175,8 +175,10 @@ def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
 
 def armed_bus(armed: dict[str, Any] | None) -> ArmedBus | None:
     """The bus of what a session left; None where that says nothing of use."""
-    bus = armed and config_of(armed).bus
-    return ArmedBus(bus) if bus else None
+    with _helping("what a session armed cannot be used"):
+        bus = armed and config_of(armed).bus
+        return ArmedBus(bus) if bus else None
+    return None
 
 
 def _tell_others(stopped: list[pathlib.Path]) -> None:
@@ -196,6 +198,15 @@ def _tell_others(stopped: list[pathlib.Path]) -> None:
         )
 
 
+@contextlib.contextmanager
+def _helping(text: str) -> Iterator[None]:
+    """Around what has to do with locks and records: a help to a stop, no condition."""
+    try:
+        yield
+    except Exception as error:
+        _say(f"{text}: {type(error).__name__}: {error}")
+
+
 def _say(text: str) -> None:
     """Print; a terminal that is gone, or lacks a letter, does not end a stop."""
     try:
@@ -211,13 +222,13 @@ def stop_units(target: ArmedBus, stay: bool = False) -> list[UnitStop]:
     asked to has been waited for. ``stay``: look whether they stay, too."""
     from rig.core import stop
 
-    target.end()
+    if target.holder is not None:
+        with _helping("cannot wait for who uses it"):
+            target.end()
     bus, silence_s, axes, lost = _drives(target)
     with contextlib.ExitStack() as stack:
-        try:
+        with _helping("stopping its drives without the lock"):
             stack.enter_context(target.lock.acquire("stop"))
-        except (OSError, Refused):  # stop without the lock
-            _say(f"{target.lock.where} is in use: stopping its drives anyway")
         line, drives = make_drives(bus, axes, silence_s)
         stack.callback(line.close)
         named = ", ".join(f"{axis.name} (unit {axis.unit})" for axis in axes)

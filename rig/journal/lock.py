@@ -16,6 +16,7 @@ import pathlib
 import re
 import signal
 import socket
+import stat
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,7 @@ FOLDER = pathlib.Path(
 HELD: dict[pathlib.Path, int] = {}  # locks of this process
 PATIENCE_S = 0.2  # a `holder` of another process keeps the flock for an instant
 ENDING, ENDING_S = "the end of a session", 8.0  # which stops its drives, and looks
+UNKNOWN = {"command": "a session", "since": "unknown"}
 _ASKERS_S = 2.0  # the same where several `holder` calls follow one another
 
 
@@ -165,7 +167,12 @@ class BusLock:
     def _open(self, flags: int) -> int:
         try:
             _folder(make=bool(flags & os.O_CREAT))
-            return os.open(self.path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            flags |= os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK  # it may be a pipe
+            fd = os.open(self.path, flags, 0o600)
+            if not stat.S_ISREG(os.fstat(fd).st_mode):
+                os.close(fd)
+                raise OSError("no regular file")
+            return fd
         except FileNotFoundError:
             raise
         except OSError as error:
@@ -196,6 +203,8 @@ def armed_files() -> list[pathlib.Path]:
 def read_armed(path: pathlib.Path) -> dict[str, Any] | None:
     """What was left for a stop; None where there is nothing, or nothing of use."""
     try:
+        if not path.is_file():  # a pipe would be waited for
+            return None
         told = json.loads(path.read_text(encoding="utf-8"))
         useful = told["bus"] and told["drives"]
         return {"standing": False, **told} if useful else None
@@ -245,8 +254,7 @@ def _opener(path: pathlib.Path) -> dict[str, Any] | None:
                     link = os.readlink(f"/proc/{pid}/fd/{fd}")
                     other = int(pid) != os.getpid()
                     if other and link.removesuffix(" (deleted)") in names:
-                        words = {"command": "a session", "since": "unknown"}
-                        return {"pid": int(pid), **words}
+                        return {"pid": int(pid), **UNKNOWN}
     return None
 
 
@@ -254,6 +262,7 @@ def _content(fd: int) -> dict[str, Any]:
     """What the file says, empty where that is not whole."""
     try:
         told = json.loads(os.pread(fd, 65536, 0))
-        return told if isinstance(told["pid"], int) and told["pid"] > 1 else {}
-    except (ValueError, KeyError, TypeError):
+        valid = isinstance(told["pid"], int) and 1 < told["pid"] < 1 << 31
+        return UNKNOWN | told if valid else {}
+    except (ValueError, KeyError, TypeError, RecursionError):
         return {}

@@ -12,7 +12,7 @@ import sys
 import pytest
 from harness import HASTY, fast_config, fast_text, simulator
 
-from rig import stop_config
+from rig import stop_config, stopping
 from rig.__main__ import main
 from rig.config import load_config
 from rig.config.config import EXAMPLES
@@ -272,6 +272,68 @@ def test_a_session_is_asked_whatever_became_of_its_lock(spoil, rig, folder, caps
     assert stopped(rig) == ALL
 
 
+@pytest.mark.parametrize("suffix", [".lock", ".armed"])
+def test_a_pipe_in_its_folder_is_not_waited_for(suffix, rig, folder):
+    folder.mkdir(mode=0o700)
+    os.mkfifo(_lock_of(rig).path.with_suffix(suffix))
+    assert main(["stop", "--config", str(rig.path)]) == 0
+    assert stopped(rig) == ALL
+
+
+def test_a_record_that_is_nested_deeply_does_not_keep_it(rig, folder):
+    folder.mkdir(mode=0o700)
+    _lock_of(rig).armed_path.write_text("[" * 100_000)
+    assert main(["stop", "--config", str(rig.path)]) == 0
+    assert stopped(rig) == ALL
+
+
+SAYS = """
+import fcntl, signal, sys, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+file = open(sys.argv[1], "a")
+fcntl.flock(file, fcntl.LOCK_EX)
+file.write(sys.argv[2])
+file.flush()
+print("holds", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize(
+    "told", ['{"pid": %d}', '{"pid": 1099511627776, "command": 5, "since": null}', ""]
+)
+def test_a_holder_that_says_too_little_is_ended_and_nothing_is_said_of_its_drives(
+    told, rig, folder, capsys, monkeypatch
+):
+    monkeypatch.setattr(stopping, "END_S", 0.1)
+    folder.mkdir(mode=0o700)
+    code = SAYS.replace("sys.argv[2]", "sys.argv[2].replace('%d', str(os.getpid()))")
+    command = [sys.executable, "-c", "import os" + code, str(_lock_of(rig).path), told]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout.readline() == "holds\n"
+        assert main(["stop", "--config", str(rig.path)]) == 0
+        said = capsys.readouterr().out
+        assert f"`a session` (process {child.pid}, since unknown)" in said
+        assert "killing it" in said and "reported" not in said
+    finally:
+        child.kill()
+        child.wait()
+        child.stdout.close()
+    assert stopped(rig) == ALL
+
+
+def test_whatever_fails_with_the_lock_the_drives_are_stopped(rig, monkeypatch, capsys):
+    def fails(*_):
+        raise ZeroDivisionError("of the lock")
+
+    for name in ("signal_holder", "acquire"):
+        monkeypatch.setattr(BusLock, name, fails)
+    monkeypatch.setattr(stopping, "armed_files", fails)
+    assert main(["stop", "--config", str(rig.path)]) == 0
+    assert stopped(rig) == ALL and "ZeroDivisionError" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     "words",
     ["", "rig.toml", "--conf rig.toml", "--config=rig.toml --now", "-c rig.toml"],
@@ -360,8 +422,6 @@ def test_one_bus_that_is_away_does_not_keep_the_other(rig, tmp_path, capsys):
         update={"bus": config.bus.model_copy(update={"host": "127.0.0.9", "port": 9})}
     )
     BusLock(away.bus).leave(away)
-    from rig import stopping
-
     rig.path.unlink()
     with contextlib.ExitStack() as stack:
         stack.enter_context(pytest.MonkeyPatch.context()).setattr(
