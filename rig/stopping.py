@@ -73,6 +73,11 @@ class ArmedBus:
         """A session armed it, and has not said that all stands."""
         return self.armed is not None and not self.armed["standing"]
 
+    @property
+    def folder(self) -> pathlib.Path:
+        """Of the device's file, which is that of its rig.toml."""
+        return pathlib.Path(str((self.armed or {}).get("device"))).parent
+
     def ask(self) -> None:
         with _helping(f"cannot find out who uses {self.lock.where}"):
             self.holder = self.lock.signal_holder(signal.SIGTERM)
@@ -132,7 +137,7 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
                 except Exception as error:  # of one bus: another is stopped
                     faults.append(error)
         with _helping("cannot look at other devices"):
-            _tell_others(reached)
+            _tell_others(reached, [target.lock.armed_path for target in targets])
         if len(faults) == len(jobs):
             raise faults[0]
         for fault in faults:
@@ -158,11 +163,16 @@ def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
         lack = f"there is no {path}" + " here" * (not given)
     except Exception as error:  # whatever is wrong, drives are stopped
         lack = f"{path} cannot be read: {getattr(error, 'strerror', None) or error}"
-    if not lack:
-        return targets
-    every = [bus for file in armed_files() if (bus := armed_bus(read_armed(file)))]
+    every: list[ArmedBus] = []
+    with _helping("cannot look at what was armed"):
+        every += filter(None, (armed_bus(read_armed(file)) for file in armed_files()))
     paths = [target.lock.path for target in targets]
     more = [bus for bus in every if bus.moves and bus.lock.path not in paths]
+    if not lack:  # a session began here, and the file has got another bus since
+        more = [bus for bus in more if bus.folder == path.parent.resolve()]
+        for bus in more:
+            _say(f"{bus.lock.where} was armed from this folder: stopping it as well")
+        return targets + more
     if not (targets or more or every):
         raise Fault(
             f"{NOTHING}: {lack}, and no session of this user has armed a device. "
@@ -181,7 +191,9 @@ def armed_bus(armed: dict[str, Any] | None) -> ArmedBus | None:
     return None
 
 
-def _tell_others(stopped: list[pathlib.Path]) -> None:
+def _tell_others(
+    stopped: list[pathlib.Path], tried: Sequence[pathlib.Path] = ()
+) -> None:
     """Say which other devices sessions of this user have armed on this computer."""
     for path in armed_files():
         armed = read_armed(path)
@@ -194,7 +206,7 @@ def _tell_others(stopped: list[pathlib.Path]) -> None:
         _say(
             f"NOT stopped, another device: {target.lock.where}{device} is armed"
             + (f" and {held_by(holder)}" if holder else ", by a session that ended")
-            + ". `jaxcal-rig stop` in its folder stops it"
+            + ". `jaxcal-rig stop` in its folder stops it" * (path not in tried)
         )
 
 
