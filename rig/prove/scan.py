@@ -114,7 +114,7 @@ def scan(
         say(f"units {names} answer late, after {timeout_s:g} s: raise bus.timeout_s")
     if echo and not settings.echo:
         say("the adapter echoes what it is sent: set bus.echo = true")
-    if not answers:
+    if not answers and not late:
         came = f", but bytes came that are not a reply: {noise}" if noise else ""
         say(
             f"no unit answers{came}. Check power, wiring, termination, the line format "

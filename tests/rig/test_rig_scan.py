@@ -4,13 +4,15 @@ import shutil
 
 import pytest
 from commission import device
-from harness import fast_text
+from harness import fast_config, fast_text, simulator
+from pymodbus.framer import FramerSocket
 
 from rig.__main__ import main
 from rig.config import ConfigError, parse_config
 from rig.config.config import EXAMPLES
-from rig.prove.scan import parse_bus
+from rig.prove.scan import parse_bus, scan
 from rig.prove.steps import edit, set_values
+from rig_workbench.simulator import parse_fault
 from rig_workbench.simulator.drive import DriveException
 
 
@@ -80,6 +82,30 @@ def test_an_empty_bus_is_said_with_what_to_check(at, capsys):
         sim.server._axis.clear()
         assert main(["scan", "--bus", bus, "--units", "2"]) == 3
     assert "baud rate" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("transport", ["tcp", "rtu_tcp"])
+def test_units_that_answer_late_are_told_as_such_alone(transport):
+    """Behind it stood that no unit answers, and that their replies are none."""
+    config = fast_config()
+    with simulator(config, transport=transport) as sim:
+        for axis in config.axis_names:
+            late = f"delayed_reply,axis={axis},seconds=0.3"
+            sim.faults.add(parse_fault(late))
+        said = []
+        scan(sim.start().bus, 3, said.append)
+    assert any(line.startswith("units 1") for line in said), said
+    assert not any("no unit answers" in line or "units 4" in line for line in said), (
+        said
+    )
+
+
+def test_a_reply_that_comes_twice_makes_no_unit_late(monkeypatch):
+    with simulator(fast_config()) as sim:
+        encode, said = FramerSocket.encode, []
+        monkeypatch.setattr(FramerSocket, "encode", lambda *a: 2 * encode(*a))
+        scan(sim.start().bus, 4, said.append)
+    assert not any("late" in line for line in said), said
 
 
 @pytest.mark.parametrize(
