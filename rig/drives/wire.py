@@ -62,6 +62,7 @@ class Wire:
         self.socket: Any = None  # or the serial port
         # Whether the adapter sends back what it is sent; None: a read will show it.
         self.echo: bool | None = settings.echo or None
+        self._unechoed = False  # the last reply to a read came without one
         self._numbered = settings.transport == "tcp"
         self._is_socket = settings.transport != "rtu"
         self._number = time.time_ns() & 0xFFFF
@@ -192,6 +193,8 @@ class Wire:
         if late:
             waited_s = self.settings.timeout_s
             return f"late by over {waited_s:g} s, like others: raise bus.timeout_s"
+        if not came and self.echo and self._unechoed:
+            return "a reply came without an echo before: take out bus.echo"
         if not came:
             return f"no reply within {timeout_s:g} s"
         if not self._numbered and came.startswith(begun):
@@ -270,8 +273,9 @@ class Wire:
         elif alike and self.echo:
             return None
         reply = rtu_reply(came, unit, function)
-        if reply is not None and function in READS and self.echo is None:
-            self.echo = False
+        if reply is not None and function in READS:
+            self._unechoed = begin < 0
+            self.echo = bool(self.echo)
         return reply
 
     def _read(self, seconds: float) -> bytes:

@@ -300,6 +300,16 @@ def test_a_stop_that_only_the_echo_acknowledged_is_sent_again():
         assert all(drive.stops for drive in sim.drives)
 
 
+def test_a_key_of_an_echo_that_never_comes_is_said_to_be_wrong():
+    config = fast_config()
+    with simulator(config, speedup=0.05) as sim, adapter(sim, False, b"") as where:
+        settings = changed(config.bus, **where, timeout_s=0.1, echo=True)
+        with Bus(settings) as bus:
+            results = stop_all([ModbusDrive(bus, axis) for axis in config.axes])
+    assert all(r.standing and not r.acknowledged for r in results), results
+    assert all("without an echo before: take out bus.echo" in str(r) for r in results)
+
+
 def test_scan_finds_an_echo_and_setup_writes_its_key(capsys):
     config = fast_config()
     with simulator(config) as sim, adapter(sim, True, b"\0") as where:
