@@ -80,21 +80,27 @@ def _send(pairs: Pairs) -> None:
 
 
 def _verify(pairs: Pairs) -> None:
-    """Poll until each stands; one that answers again is told to stop once more."""
+    """Poll until each stands, as long again while one without a motion is still to be
+    looked at; one that answers again is told to stop once more."""
     begun = time.monotonic()
     end = begun + VERIFY_S
     before: dict[int, int] = {}
+    quick = False
     while moving := [pair for pair in pairs if not pair[1].standing]:
+        settling = False
+        quick = not quick  # every second look has time for a slow unit's reply
         for drive, result in _responsive_first(moving):
             line = drive.line
             result.acknowledged &= not line.doubts(result.unit)
-            wait_s = line.quick_s if drive.axis.unit in line.silent else None
+            silent = drive.axis.unit in line.silent
+            wait_s = line.quick_s if quick and silent else None
             try:
                 with line.urgent(wait_s):
                     status = drive.status(retries=0)
             except Exception as error:
                 result.detail = str(error)
                 continue
+            settling |= not status.moving
             _send([(drive, result)])
             last = before.get(result.unit)
             still = last is not None and abs(status.position - last) <= STILL_COUNTS
@@ -104,7 +110,7 @@ def _verify(pairs: Pairs) -> None:
                 gone = time.monotonic() - begun
                 late = f"it moved on for {gone:.1f} s" * (gone > WENT_ON_S)
                 result.detail = "alarm" if status.fault else late
-        if time.monotonic() > end:
+        if time.monotonic() > end + VERIFY_S * settling:
             return
         time.sleep(POLL_S)
 

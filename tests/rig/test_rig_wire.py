@@ -300,6 +300,20 @@ def test_a_stop_that_only_the_echo_acknowledged_is_sent_again():
         assert all(drive.stops for drive in sim.drives)
 
 
+def test_drives_that_answer_late_beside_an_echo_are_seen_standing(monkeypatch):
+    """One that had not answered in time was from then on given no time to."""
+    monkeypatch.setattr(core_stop, "VERIFY_S", 3.0)
+    config = fast_config()
+    with simulator(config, speedup=0.05) as sim, adapter(sim, True, b"") as where:
+        for axis in config.axis_names:
+            late = f"delayed_reply,axis={axis},seconds=0.15"
+            sim.faults.add(parse_fault(late))
+        settings = changed(config.bus, **where, timeout_s=0.3)
+        with Bus(settings) as bus:
+            results = stop_all([ModbusDrive(bus, axis) for axis in config.axes])
+    assert all(r.acknowledged and r.standing for r in results), results
+
+
 def test_a_key_of_an_echo_that_never_comes_is_said_to_be_wrong():
     config = fast_config()
     with simulator(config, speedup=0.05) as sim, adapter(sim, False, b"") as where:
