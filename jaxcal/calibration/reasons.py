@@ -154,7 +154,7 @@ def saturated(fit: Fit) -> Reason | None:
     counts = at_ends.sum(axis=1)
     for j in (counts.sum(axis=0) > least).nonzero()[0]:
         ends = [i for i in (0, 1) if counts[i][j] > 1]
-        rows = at_ends[ends, :, j].any(axis=0)
+        rows = np.asarray(at_ends[ends, :, j].any(axis=0))
         inner = np.unique((readings[~rows, j] / step[j]).round(), return_counts=True)[1]
         if rows.sum() < least or len(inner) < 2 or inner.mean() > _TWICE:
             continue
