@@ -75,7 +75,7 @@ class ArmedBus:
 
     @property
     def folder(self) -> pathlib.Path:
-        """Of the device's file, which is that of its rig.toml."""
+        """The folder of the device's record, which is that of its rig.toml."""
         return pathlib.Path(str((self.armed or {}).get("device"))).parent
 
     def ask(self) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import pathlib
+import shutil
 import signal
+import tempfile
 
 # A shell that runs the tests in the background has SIGINT ignored, and every program
 # that a test starts and interrupts would inherit that.
@@ -17,6 +20,11 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see runtime/cache.py
 
 # Threads of numpy wait for one another on a busy core: 35 s for what takes one .6.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Locks of each test process are its own: a stop asks, and ends, who holds a bus, which
+# may be a test in another process, or a device that this computer moves.
+os.environ["JAXCAL_RIG_LOCKS"] = tempfile.mkdtemp(prefix="jaxcal-locks-")
+atexit.register(shutil.rmtree, os.environ["JAXCAL_RIG_LOCKS"], ignore_errors=True)
 
 import hypothesis
 import jax
