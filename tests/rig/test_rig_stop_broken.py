@@ -432,24 +432,6 @@ def test_one_bus_that_is_away_does_not_keep_the_other(rig, tmp_path, capsys):
     assert "NOTHING WAS STOPPED" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("elsewhere", [False, True])
-def test_what_was_armed_from_its_folder_is_stopped_though_the_file_names_another_bus(
-    elsewhere, rig, tmp_path, monkeypatch, capsys
-):
-    """It was called another device, and went on."""
-    monkeypatch.setattr(stopping, "REOPEN_S", 0.2)
-    _armed(rig)
-    folder = tmp_path / "elsewhere" if elsewhere else tmp_path
-    folder.mkdir(exist_ok=True)
-    path = folder / "rig.toml"
-    path.write_text(rig.text.replace(f"port = {rig.port}", "port = 9"))
-    assert main(["stop", "--config", str(path)]) == 3
-    said = capsys.readouterr().out
-    assert stopped(rig) == (set() if elsewhere else ALL)
-    assert ("NOT stopped, another device" in said) == elsewhere
-    assert ("armed from this folder: stopping it as well" in said) != elsewhere
-
-
 # Its own reading says what the schema's does
 
 

@@ -3,14 +3,16 @@
 import time
 
 import pytest
-from harness import changed, fast_text
+from harness import changed, fast_config, fast_text, simulator
 from test_rig_wire import behind_a_gateway, folder  # noqa: F401  # its locks
 
 from rig import stopping
 from rig.__main__ import main
+from rig.config import load_config
 from rig.core.stop import stop_all
 from rig.drives.bus import Bus
 from rig.drives.modbus import ModbusDrive
+from rig.journal.lock import BusLock
 from rig_workbench.simulator import parse_fault
 
 
@@ -67,3 +69,26 @@ def test_a_unit_that_no_frame_was_sent_to_is_named():
         with Bus(settings) as bus:
             results = stop_all([ModbusDrive(bus, axis) for axis in config.axes])
     assert all("NO STOP COULD BE SENT, NOT seen standing" in str(r) for r in results)
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_what_was_armed_from_its_folder_is_stopped_though_the_file_names_another_bus(
+    elsewhere, tmp_path, monkeypatch, capsys
+):
+    """It was called another device, and went on."""
+    monkeypatch.setattr(stopping, "REOPEN_S", 0.2)
+    with simulator(fast_config(), speedup=0.02) as sim:
+        text = fast_text({"port = 5020": f"port = {sim.start().bus.port}"})
+        path = tmp_path / "rig.toml"
+        path.write_text(text)
+        config = load_config(path)
+        BusLock(config.bus).leave(config)
+        set_moving(sim, config)
+        (tmp_path / "elsewhere").mkdir()
+        path = tmp_path / "elsewhere" / "rig.toml" if elsewhere else path
+        path.write_text(text.replace(f"port = {config.bus.port}", "port = 9"))
+        assert main(["stop", "--config", str(path)]) == 3
+        assert [bool(drive.stops) for drive in sim.drives] == [not elsewhere] * 3
+    said = capsys.readouterr().out
+    assert ("NOT stopped, another device" in said) == elsewhere
+    assert ("armed from this folder: stopping it as well" in said) != elsewhere
