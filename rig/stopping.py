@@ -212,7 +212,7 @@ def _tell_others(
 
 @contextlib.contextmanager
 def _helping(text: str) -> Iterator[None]:
-    """Around what has to do with locks and records: a help to a stop, no condition."""
+    """Report a fault of locks or records and go on: no stop depends on them."""
     try:
         yield
     except Exception as error:

@@ -59,7 +59,7 @@ def measure(standing: Arrival, samples: int | None = None) -> dict[str, Any]:
     angles, commanded = frame.angles(attitude), device.config.to_deg(target)
     before = [status.position for status in statuses]
     feedback = [status.position for status in device.statuses()]
-    for places in (before, feedback):  # nobody moved it while it was measured
+    for places in (before, feedback):  # a drive may have moved meanwhile
         _check_position(device, target, places)
     if device.oriented:
         _check_agreement(device, commanded, angles)

@@ -155,7 +155,7 @@ def test_mutated_sensor_logger_messages(count):
 
 
 class Clock(types.SimpleNamespace):
-    """The test's own, which goes on where somebody waits."""
+    """A clock of the test: waiting advances it and takes no time."""
 
     now = 100.0
 

@@ -77,7 +77,7 @@ def test_visits_are_taken_in_the_order_of_the_journal(tmp_path):
 def test_stop_names_the_devices_that_it_did_not_stop(tmp_path, monkeypatch, capsys):
     """G: it said "standing" of one device while another went on."""
     monkeypatch.setattr(lock, "FOLDER", tmp_path / "locks")
-    monkeypatch.setattr(stopping, "REOPEN_S", 0.5)  # nobody listens
+    monkeypatch.setattr(stopping, "REOPEN_S", 0.5)  # no server on these ports
     buses = []
     for port in (6001, 6002, 6003):
         config = parse_config(

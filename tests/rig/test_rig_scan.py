@@ -86,7 +86,7 @@ def test_an_empty_bus_is_said_with_what_to_check(at, capsys):
 
 @pytest.mark.parametrize("transport", ["tcp", "rtu_tcp"])
 def test_units_that_answer_late_are_told_as_such_alone(transport):
-    """Behind it stood that no unit answers, and that their replies are none."""
+    """It used to add that no unit answers, and called their replies no replies."""
     config = fast_config()
     with simulator(config, transport=transport) as sim:
         for axis in config.axis_names:

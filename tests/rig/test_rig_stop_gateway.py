@@ -25,7 +25,7 @@ def set_moving(sim, config):
 @pytest.mark.parametrize("refuses", ["accepts and closes", "is closed"])
 @pytest.mark.parametrize("fault", ["delayed_reply,seconds=0.1", "dead_drive"])
 def test_every_unit_gets_its_stop_over_the_only_connection(refuses, fault):
-    """The second was refused, and the good first lay unused from then on."""
+    """The second was refused, and the first, which works, was no longer used."""
     with behind_a_gateway() as (sim, gateway, settings, config):
         set_moving(sim, config)
         axes = ["pitch"] if fault == "dead_drive" else ["pitch", "yaw", "roll"]
@@ -75,7 +75,7 @@ def test_a_unit_that_no_frame_was_sent_to_is_named():
 def test_what_was_armed_from_its_folder_is_stopped_though_the_file_names_another_bus(
     elsewhere, tmp_path, monkeypatch, capsys
 ):
-    """It was called another device, and went on."""
+    """Its session was reported as another device, and was not stopped."""
     monkeypatch.setattr(stopping, "REOPEN_S", 0.2)
     with simulator(fast_config(), speedup=0.02) as sim:
         text = fast_text({"port = 5020": f"port = {sim.start().bus.port}"})

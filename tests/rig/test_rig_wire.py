@@ -301,7 +301,7 @@ def test_a_stop_that_only_the_echo_acknowledged_is_sent_again():
 
 
 def test_drives_that_answer_late_beside_an_echo_are_seen_standing(monkeypatch):
-    """One that had not answered in time was from then on given no time to."""
+    """A unit that was late once was never again given enough time to answer."""
     monkeypatch.setattr(core_stop, "VERIFY_S", 3.0)
     config = fast_config()
     with simulator(config, speedup=0.05) as sim, adapter(sim, True, b"") as where:
