@@ -124,7 +124,7 @@ def identify(
         model, commands, measured, weights, input_names, output_names
     )
     n, m = len(inputs), len(outputs)
-    noise, plain_noise = _noise(noise, noise_std, common_noise, m)
+    noise, plain_noise = _noise(noise, noise_std, common_noise, outputs)
     units: dict[str, Any]
     units = {"command_unit": command_unit, "measured_unit": measured_unit}
     for name, unit in units.items():
@@ -229,10 +229,13 @@ def _noise(
     noise: Noise | None,
     noise_std: ArrayLike | None,
     common_noise: bool | Sequence[Any] | None,
-    num_outputs: int,
+    outputs: tuple[str, ...],
 ) -> tuple[Noise, bool]:
     """The noise as given, and whether that is at most a level of each output."""
-    noise = as_noise(noise)
+    num_outputs = len(outputs)
+    noise_std = of_frame("noise_std", noise_std, outputs, MEASURED)
+    if not isinstance(noise, Noise):
+        noise = as_noise(of_frame("noise", noise, outputs, MEASURED))
     if not (common_noise is None or isinstance(common_noise, bool)):
         labels = () if isinstance(common_noise, str) else np.atleast_1d(common_noise)
         if np.shape(labels) != (num_outputs,):

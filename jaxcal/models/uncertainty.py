@@ -20,6 +20,7 @@ from jaxcal.checks import (
     require_none,
 )
 from jaxcal.information.singular import significant
+from jaxcal.tables import by_name, require_unnamed
 
 PerParameter = ArrayLike | Mapping[str, float]
 
@@ -42,7 +43,8 @@ class ResolvedPrior:
 class Prior:
     """Independent normal prior of a model's parameters.
 
-    ``std`` and ``mean`` are one number, (p,), or a mapping from name to number.
+    ``std`` and ``mean`` are one number, (p,), or a mapping from name to number, as a
+    row of a frame is.
     """
 
     std: PerParameter  # in the parameters' units; inf, or left out: nothing is known
@@ -53,7 +55,7 @@ class Prior:
     def __post_init__(self) -> None:
         if isinstance(self.fixed, str) or not isinstance(self.fixed, Collection):
             raise ValueError(f"fixed must be a sequence of names, got {self.fixed!r}")
-        stds = self.std
+        stds = by_name("std of the prior", self.std)
         stds = [*stds.values()] if isinstance(stds, Mapping) else stds
         std = numbers("std of the prior", stds, finite=False)
         if not (std > 0.0).all():
@@ -87,6 +89,7 @@ def _by_name(
     argument: str, values: PerParameter | None, names: tuple[str, ...], default: Any
 ) -> Array:
     """(p,) ``values`` in the order of ``names``; ``default`` where they are silent."""
+    values = by_name(argument, values)
     if values is None or isinstance(values, Mapping):
         result = np.empty(len(names))
         result[:] = default
@@ -110,6 +113,8 @@ class Noise:
     command_std: ArrayLike | None = None
 
     def __post_init__(self) -> None:
+        for name, values in vars(self).items():
+            require_unnamed(f"{name} of the noise", values)
         if self.std is not None and self.covariance is not None:
             raise ValueError("give std or covariance of the noise, not both")
         if self.std is not None:

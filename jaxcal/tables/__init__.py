@@ -3,12 +3,14 @@
 from jaxcal.tables.decisions import COMMANDS, MEASURED, Decision, columns_by_name, say
 from jaxcal.tables.files import csv_text, parse, read_table
 from jaxcal.tables.frames import (
+    by_name,
     header_of,
     inputs_of,
     limits_of_frame,
     names_in,
     of_frame,
     outputs_of,
+    require_unnamed,
     say_order,
     table_of_frame,
 )
@@ -19,6 +21,7 @@ __all__ = [
     "MEASURED",
     "Decision",
     "Table",
+    "by_name",
     "columns_by_name",
     "csv_text",
     "header_of",
@@ -29,6 +32,7 @@ __all__ = [
     "outputs_of",
     "parse",
     "read_table",
+    "require_unnamed",
     "say",
     "say_order",
     "table_of_frame",

@@ -53,6 +53,22 @@ def header_of(argument: str, values: Any) -> list[str]:
     return names
 
 
+def by_name(argument: str, values: Any) -> Any:
+    """A row that has names as a dict, else as given."""
+    if isinstance(values, Mapping) or not (names := header_of(argument, values)):
+        return values
+    return {name: _column(values, name) for name in names}
+
+
+def require_unnamed(argument: str, values: Any) -> None:
+    """Refuse a row that has names where nothing says which belongs where."""
+    if names := header_of(argument, values):
+        raise ValueError(
+            f"{argument} is read by position, and this has the names "
+            f"{', '.join(names)}: pass its numbers alone, in the order of the columns"
+        )
+
+
 def _names(values: Any) -> list[Any]:
     """Names as values hold them; [] where they have none."""
     if isinstance(values, np.ndarray | np.void):

@@ -384,3 +384,33 @@ def test_what_is_not_needed_is_said_once(calibration):
             question(both)
         texts = [str(warning.message) for warning in said]
         assert texts == [f"{argument}: column 'depth' is ignored (not needed)"]
+
+
+def test_levels_of_noise_and_of_a_prior_are_read_by_name():
+    names = [*READINGS][::-1]
+    level = pandas.Series([0.3, 0.2, 0.1], index=names)
+    plain = jaxcal.identify(COMMANDS, READINGS, noise_std=[0.1, 0.2, 0.3])
+    for noise in ({"noise_std": level}, {"noise": level}):
+        fit = jaxcal.identify(COMMANDS, READINGS, **noise)
+        np.testing.assert_array_equal(fit.noise_std, plain.noise_std)
+    model = jaxcal.models.Affine(3, 3)
+    stds = pandas.Series({"by": 2.0, "a12": 0.5})
+    given = jaxcal.Prior(stds, mean=stds).resolve(model)
+    wanted = jaxcal.Prior(stds.to_dict(), mean=stds.to_dict()).resolve(model)
+    np.testing.assert_array_equal(given.precisions, wanted.precisions)
+    np.testing.assert_array_equal(given.mean, wanted.mean)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda named: jaxcal.Noise(named),
+        lambda named: jaxcal.Noise(1.0, command_std=named),
+        lambda named: jaxcal.Motion(named, 1.0),
+        lambda named: jaxcal.Motion(1.0, named),
+        lambda named: jaxcal.select(COMMANDS, 4, noise=named),
+    ],
+)
+def test_names_that_nothing_can_be_matched_with_are_refused(make):
+    with pytest.raises(ValueError, match=r"read by position.* roll, pitch, yaw:"):
+        make(pandas.Series([1.0, 2.0, 3.0], index=["roll", "pitch", "yaw"]))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import Array, array_of, numbers
+from jaxcal.tables import require_unnamed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Motion:
 
     def __post_init__(self) -> None:
         for name in ("speed", "acceleration"):
+            require_unnamed(name, getattr(self, name))
             values = numbers(name, getattr(self, name))
             if values.ndim > 1 or not values.size or (values <= 0.0).any():
                 raise ValueError(
