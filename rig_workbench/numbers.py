@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import re
 import socket
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -21,7 +20,7 @@ from rig.config.settings import BusSettings, ReadingsSettings
 from rig.drives.bus import Bus
 from rig.drives.modbus import decoded
 from rig.readings.attitude import Array, Reading
-from rig.readings.source import JumpGate, ReadingError, Source, listener_of
+from rig.readings.source import JumpGate, ReadingError, Receiver
 
 NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{0,17})?(?:[eE][+-]?[0-9]{1,2})?")
 MAX_LINE = 1024  # bytes
@@ -33,7 +32,7 @@ def _largest_change(before: Array, now: Array) -> float:
     return float(np.abs(now - before).max())
 
 
-class Sensor(Source):
+class Sensor(Receiver):
     """Numbers as they come in, on one thread."""
 
     def __init__(
@@ -41,45 +40,20 @@ class Sensor(Source):
         settings: ReadingsSettings,
         report: Callable[..., object] = lambda event, **fields: None,
     ) -> None:
-        super().__init__(settings.stale_s, report)
+        super().__init__(settings, report)
         self.settings: ReadingsSettings = settings
         self.connections = 1  # numbers are the same whoever connects again
-        self._port = settings.port
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="sensor", daemon=True)
-        self._socket: socket.socket | None = None
         self._gate = JumpGate(_largest_change, settings.most_jump)
 
     @property
-    def port(self) -> int:
-        return self._port
-
-    @property
     def where(self) -> str:
-        s = self.settings
-        return s.device or f"{s.host}:{self.port}"
-
-    def open(self) -> Sensor:
-        try:
-            self._socket = listener_of(self.settings)
-        except OSError as error:
-            raise self.closed(error) from None
-        if self._socket is not None:
-            self._socket.settimeout(LOOK_S)
-            self._port = int(self._socket.getsockname()[1])
-        self._thread.start()
-        return self
-
-    def close(self) -> None:
-        self._closing.set()
-        if self._thread.is_alive():
-            self._thread.join(2.0)
-        if self._socket is not None:
-            self._socket.close()
+        return self.settings.device or super().where
 
     # On the thread
 
-    def _run(self) -> None:
+    def receive(self) -> None:
+        if self._listener is not None:
+            self._listener.settimeout(LOOK_S)
         ways = {"udp": self._datagrams, "modbus": self._registers}
         way = ways.get(self.settings.transport, self._lines)
         while not self._closing.is_set():
@@ -121,10 +95,10 @@ class Sensor(Source):
             )
             stack.enter_context(port)
             return lambda: port.read(max(1, port.in_waiting)) or None, port.write
-        if self._socket is not None:
+        if self._listener is not None:
             while True:
                 try:
-                    connection, (address, *_) = self._socket.accept()
+                    connection, (address, *_) = self._listener.accept()
                     break
                 except TimeoutError:
                     if self._closing.is_set():
@@ -146,10 +120,10 @@ class Sensor(Source):
         return read, connection.sendall
 
     def _datagrams(self) -> None:
-        assert self._socket is not None
+        assert self._listener is not None
         while not self._closing.is_set():
             with contextlib.suppress(TimeoutError):
-                data, (address, *_) = self._socket.recvfrom(65536)
+                data, (address, *_) = self._listener.recvfrom(65536)
                 lines = re.split(rb"[\r\n]+", data) if self._hears(address) else ()
                 for line in filter(None, lines):
                     self._take(line)

@@ -8,7 +8,6 @@ import dataclasses
 import http
 import re
 import socket
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -18,7 +17,7 @@ import numpy as np
 
 from rig.config.settings import ImuSettings
 from rig.readings.attitude import Array, Reading
-from rig.readings.source import BACKLOG, Source, listener_of
+from rig.readings.source import BACKLOG, Receiver
 from rig.readings.stream import MAX_BODY, LineSplitter, StreamParser
 
 RECONNECT_S = 0.2
@@ -40,7 +39,7 @@ class Connection:
     splitter: LineSplitter = dataclasses.field(default_factory=LineSplitter)
 
 
-class Imu(Source):
+class Imu(Receiver):
     """The attitude of the phone, (3, 3) to its world: of one, whoever else connects.
 
     Who may not be heard is refused unread. At most MOST_OPEN connections are open, none
@@ -58,38 +57,17 @@ class Imu(Source):
         settings: ImuSettings,
         report: Callable[..., object] = lambda event, **fields: None,
     ) -> None:
-        super().__init__(settings.stale_s, report)
+        super().__init__(settings, report)
         self.settings: ImuSettings = settings
         self.world = np.eye(3)
         self.parser = StreamParser(settings)
         self._counts = self.parser.counts
         self._current: Connection | None = None  # that lines are taken of
-        self._closing = threading.Event()
-        self._port = settings.port
-        self._listener: socket.socket | None = None
-        self._thread = threading.Thread(
-            target=lambda: asyncio.run(self._run()), name="imu", daemon=True
-        )
 
-    def open(self) -> Imu:
-        try:
-            self._listener = listener_of(self.settings)
-        except OSError as error:
-            raise self.closed(error) from None
+    def receive(self) -> None:
         if self._listener is not None:
             self._listener.setblocking(False)
-            self._port = int(self._listener.getsockname()[1])
-        self._thread.start()
-        return self
-
-    def close(self) -> None:
-        self._closing.set()
-        if self._thread.is_alive():
-            self._thread.join(2.0)
-
-    @property
-    def where(self) -> str:
-        return f"{self.settings.host}:{self.port}"
+        asyncio.run(self._run())
 
     def turn(self, world: Array) -> None:
         """Turn all readings by (3, 3), those that were received too."""

@@ -45,18 +45,6 @@ class JumpGate:
         return False
 
 
-def listener_of(settings: Any) -> socket.socket | None:
-    """What hears, where this computer is called; OSError where it cannot be opened."""
-    place = (settings.host, settings.port)
-    if settings.transport == "listen":
-        return socket.create_server(place, backlog=BACKLOG)
-    if settings.transport != "udp":
-        return None
-    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    made.bind(place)
-    return made
-
-
 class Source(abc.ABC):
     """Readings, now and over the last seconds.
 
@@ -191,3 +179,49 @@ class Source(abc.ABC):
                         f"address, port and [{self.table}]"
                     ) from None
             time.sleep(0.01)
+
+
+class Receiver(Source):
+    """A source that is called or calls at ``host`` and ``port`` of its settings."""
+
+    def __init__(
+        self,
+        settings: Any,
+        report: Callable[..., object] = lambda event, **fields: None,
+    ) -> None:
+        super().__init__(settings.stale_s, report)
+        self.settings = settings
+        self._port = settings.port
+        self._closing = threading.Event()
+        self._listener: socket.socket | None = None  # where this computer is called
+        self._thread = threading.Thread(target=self.receive, daemon=True)
+
+    @abc.abstractmethod
+    def receive(self) -> None:
+        """Take what comes, on the thread, until it is closing."""
+
+    @property
+    def where(self) -> str:
+        return f"{self.settings.host}:{self.port}"
+
+    def open(self) -> Any:
+        place = (self.settings.host, self.settings.port)
+        try:
+            if self.settings.transport == "listen":
+                self._listener = socket.create_server(place, backlog=BACKLOG)
+            elif self.settings.transport == "udp":
+                self._listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                self._listener.bind(place)
+        except OSError as error:
+            raise self.closed(error) from None
+        if self._listener is not None:
+            self._port = int(self._listener.getsockname()[1])
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+        if self._listener is not None:
+            self._listener.close()
