@@ -461,11 +461,8 @@ def _bus_table(data: dict[str, Any]) -> dict[str, Any]:
     for table in [table for name, table in tables if _called(name, "bus")]:
         bus |= {key: table[key] for key in table if not bus.get(key)}
     places = [t for _, t in tables if _is_transport(_near(t, "transport"))]
-    return next((t for t in (bus, *places) if _place_of(t)), bus)
-
-
-def _place_of(table: dict[str, Any]) -> Any:
-    return _near(table, "host") or _near(table, "device")
+    says = (t for t in (bus, *places) if _near(t, "host") or _near(t, "device"))
+    return next(says, bus)
 
 
 def _is_transport(value: Any) -> bool:

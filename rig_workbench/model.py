@@ -80,14 +80,11 @@ class DeviceModel:
         """The parameters from chosen postures: a ``jaxcal.Calibration``."""
         limit = config.session.verify_limit_deg
         return fit_quietly(
+            config,
             *self.outputs(config, records),
             model=self.model,
             prior=self.prior,
             accuracy=limit if self.model.accuracy_units(config.output_unit) else None,
-            input_names=config.axis_names,
-            output_names=config.output_names,
-            command_unit=config.axis_unit,
-            measured_unit=config.output_unit,
         )
 
     def held_out_errors(

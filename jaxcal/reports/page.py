@@ -10,7 +10,8 @@ import base64
 import dataclasses
 import functools
 import os
-from collections.abc import Sequence
+import pathlib
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from jaxcal.extras import needs
@@ -134,22 +135,32 @@ def render(page: Page) -> str:
 @functools.cache
 def _template() -> Any:
     """The page's template; compiling it takes a quarter of a second."""
+    path = pathlib.Path(__file__).with_name("page.html.j2")
     with needs("plots", "an HTML report"):
-        import jinja2
+        return template(
+            path,
+            html=True,
+            pieces=lambda c: c if isinstance(c, list | tuple) else (c,),
+            kind=lambda piece: type(piece).__name__.lower(),
+        )
+
+
+def template(
+    path: pathlib.Path, html: bool = False, **filters: Callable[[Any], Any]
+) -> Any:
+    """A jinja2 template by its file, and what it may call; ``html`` is escaped."""
+    import jinja2
 
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("jaxcal.reports", ""),
-        autoescape=True,
+        loader=jinja2.FileSystemLoader(path.parent),
+        autoescape=html,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {
-        "pieces": lambda c: c if isinstance(c, list | tuple) else (c,),
-        "kind": lambda piece: type(piece).__name__.lower(),
-    }
-    return environment.get_template("page.html.j2")
+    environment.filters |= filters
+    return environment.get_template(path.name)
 
 
 def write_page(path: str | os.PathLike[str], page: Page) -> None:

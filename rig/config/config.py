@@ -274,7 +274,9 @@ class RigConfig(Section):
             values = {"map": family, **scale}
             fingerprint |= {f"axes.{axis.name}.{name}": values[name] for name in values}
         if self.model is not None:
-            data = self.model.model_dump() | {"digest": self._model_digest}
+            text = self.model_path.read_bytes() if self.model_path else b""
+            digest = hashlib.sha256(text).hexdigest()[:8] if self.model_path else ""
+            data = self.model.model_dump() | {"digest": digest}
             fingerprint |= {f"model.{name}": data[name] for name in data}
         if self.imu is None:
             assert self.readings is not None
@@ -283,11 +285,6 @@ class RigConfig(Section):
         fingerprint["mechanism.order"] = self.mechanism.order
         imu = self.imu.model_dump(mode="json", include=set(PHONE))
         return fingerprint | {f"imu.{name}": imu[name] for name in PHONE}
-
-    @property
-    def _model_digest(self) -> str:
-        path = self.model_path
-        return "" if path is None else hashlib.sha256(path.read_bytes()).hexdigest()[:8]
 
     def stop_fingerprint(self) -> dict[str, str]:
         """Key to digest of what says how each drive is stopped, and stands."""

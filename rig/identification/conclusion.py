@@ -30,13 +30,21 @@ def pairs(records: list[Record]) -> tuple[Array, Array]:
     return commands, np.array([r["measured_deg"] for r in records], dtype=np.float64)
 
 
-def fit_quietly(*measurements: Array, **options: Any) -> Any:
-    """``jaxcal.identify`` without its warning: the summary holds the verdict."""
+def fit_quietly(config: RigConfig, *measurements: Array, **options: Any) -> Any:
+    """``jaxcal.identify``, in names and units of the device, without its warning: the
+    summary holds the verdict."""
     import jaxcal
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        return jaxcal.identify(*measurements, **options)
+        return jaxcal.identify(
+            *measurements,
+            input_names=config.axis_names,
+            output_names=config.output_names,
+            command_unit=config.axis_unit,
+            measured_unit=config.output_unit,
+            **options,
+        )
 
 
 def identify_affine(
@@ -52,15 +60,7 @@ def identify_affine(
     variance of the zero posture's mean over that of another's, which shifts every
     posture equally and so adds to the variance of the bias.
     """
-    fitted = fit_quietly(
-        *pairs(records),
-        noise_std=noise_std,
-        input_names=config.axis_names,
-        output_names=config.output_names,
-        command_unit=config.axis_unit,
-        measured_unit=config.output_unit,
-        notes=notes,
-    )
+    fitted = fit_quietly(config, *pairs(records), noise_std=noise_std, notes=notes)
     if noise_std is None:
         return fitted
     covariance = np.array(fitted.joint_covariance)
@@ -70,7 +70,7 @@ def identify_affine(
 
 
 def uncertainty(
-    chosen: list[Record], held_out: list[Record], zero_share: float
+    config: RigConfig, chosen: list[Record], held_out: list[Record], zero_share: float
 ) -> dict[str, Any]:
     """noise_std_deg (m,) of a recorded mean, dof of an axis, basis, ci95 (m, n + 1):
     95 % half-widths of [A | b] that hold all of these at once (Bonferroni).
@@ -83,7 +83,7 @@ def uncertainty(
     everything, count = [*chosen, *held_out], len(chosen[0]["commanded_deg"]) + 1
     basis, dof = f"the fit of all {len(everything)} postures", len(everything) - count
     if dof:
-        noise = np.array(fit_quietly(*pairs(everything)).noise_std)
+        noise = np.array(fit_quietly(config, *pairs(everything)).noise_std)
     else:
         basis = "scatter of single readings only"
         dof = (chosen[0]["samples"] - 1) * len(chosen)
@@ -233,7 +233,7 @@ def conclude(
         errors.pop("after", None)
     # The noise is that which the held-out postures show.
     zero_share = chosen[0]["samples"] / zero["samples"]
-    limits = uncertainty(chosen, held_out, zero_share)
+    limits = uncertainty(config, chosen, held_out, zero_share)
     in_order = sorted([*chosen, *held_out], key=lambda record: record["seq"])
     mispairing = identify_affine(config, in_order).mispairing
     reasons = [mispairing.reason] if mispairing else []

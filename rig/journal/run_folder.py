@@ -66,15 +66,13 @@ def measured_postures(records: list[Record]) -> dict[str, Record]:
     return found
 
 
-class Journal:
+class Journal(JsonLines):
     """The one writer of a journal; a second one on the same run is refused."""
 
     def __init__(self, path: pathlib.Path) -> None:
-        self.path = path
         with _told(path):
             # A live page that asks `is_written` holds it for an instant.
-            self._lines = JsonLines(path, _whole, patience_s=PATIENCE_S)
-        self.records = self._lines.records
+            super().__init__(path, _whole, patience_s=PATIENCE_S)
         last = self.records[-1]["time"] if self.records else 0.0
         self._clock = max(time.time(), last) - time.monotonic()
 
@@ -88,16 +86,13 @@ class Journal:
             return {"seq": len(self.records), "time": now, "event": event, **fields}
 
         try:
-            return self._lines.append(make, sync=sync)
+            return self.append(make, sync=sync)
         except OSError as error:
             text = f"cannot write {self.path}: {error.strerror or error}"
             raise JournalError(text) from None
 
     def events(self, event: str) -> list[Record]:
         return [record for record in self.records if record["event"] == event]
-
-    def close(self) -> None:
-        self._lines.close()
 
 
 JOURNAL = "journal.jsonl"

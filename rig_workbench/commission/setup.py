@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxcal.files import write_text
+from jaxcal.reports.page import template
 from rig.config import RigConfig, load_config, parse_config
 from rig.config.axis import DEFAULT_ROTATES as DEFAULT_AXES
 from rig.config.settings import BusSettings, ImuSettings, ReadingsSettings
@@ -30,7 +31,6 @@ from rig.readings.geometry import Attitudes, Geometry, geometry_of
 from rig.readings.phone import Imu
 from rig.readings.source import Source
 from rig_workbench.model import joint_names
-from rig_workbench.outputs import template
 
 if TYPE_CHECKING:
     from rig_workbench.simulator import Simulator

@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from rig_workbench.outputs import template
+from jaxcal.reports.page import template
 from rig_workbench.outputs.view import angle
 
 

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.reports.page import template
 from rig.config.axis import Scale
 from rig.config.config import names_of, units_of
 from rig.faults import Refused
 from rig.journal.run_folder import Record
 from rig.outputs.messages import recalibrate
 from rig.readings.attitude import Array
-from rig_workbench.outputs import template
 
 NUMBERS = ("matrix", "offset_deg", "min_deg", "max_deg", "pulses_per_deg", "min_pulses",
            "max_pulses")  # fmt: skip
@@ -180,13 +180,11 @@ def _real(value: float) -> str:
     return mantissa + ".0" * ("." not in mantissa) + e + exponent
 
 
-def _json(inverse: dict[str, Any]) -> str:
-    data = {"format": "jaxcal-inverse", "schema": 1, **inverse}
-    return json.dumps(data, indent=1) + "\n"
-
-
 LANGUAGES: dict[str, Callable[[dict[str, Any]], str]] = {
     "c": lambda inverse: _code("calibration.h.j2", inverse),  # C99
     "st": lambda inverse: _code("calibration.st.j2", inverse),  # IEC 61131-3
-    "json": _json,
+    "json": lambda inverse: (
+        json.dumps({"format": "jaxcal-inverse", "schema": 1, **inverse}, indent=1)
+        + "\n"
+    ),
 }

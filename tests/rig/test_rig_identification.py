@@ -25,6 +25,7 @@ from rig.readings.geometry import Attitudes
 from rig_workbench.refit import attitudes
 from rig_workbench.simulator import Truth
 
+CONFIG = fast_config()
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 LETTERS = ("X", "Z", "Y")
 
@@ -80,7 +81,7 @@ def test_intervals_hold_at_least_as_often_as_they_say(rng, phi):
         off = sigma * autoregression(rng, phi, 100)
         records = [record(rng, x, off.mean(0), phi, sigma, 25, repeat) for x in u]
         fitted = jaxcal.identify(u[:4], [r["measured_deg"] for r in records[:4]])
-        stated = uncertainty(records[:4], records[4:], 25 / 100)
+        stated = uncertainty(CONFIG, records[:4], records[4:], 25 / 100)
         error = np.abs(np.column_stack([fitted.matrix, fitted.bias]) - TRUTH)
         one = special.stdtrit(held, 0.975) / special.stdtrit(held, 1 - 0.025 / 12)
         inside.append(error <= one * np.array(stated["ci95"]))
@@ -94,7 +95,7 @@ def test_without_held_out_postures_the_basis_says_so(rng):
     records = [
         record(rng, x, 0, 0.0, 0.05, 25, 0.0) for x in rng.uniform(-18, 18, (4, 3))
     ]
-    stated = uncertainty(records, [], 0.25)
+    stated = uncertainty(CONFIG, records, [], 0.25)
     assert stated["basis"] == "scatter of single readings only"
     np.testing.assert_allclose(stated["noise_std_deg"], 0.05 / 5, rtol=0.5)
 
@@ -108,7 +109,7 @@ def test_the_noise_of_each_axis_is_its_own(rng):
             {"commanded_deg": a, "measured_deg": b, "std_deg": [0.1] * 3, "samples": 25}
             for a, b in zip(u.tolist(), y.tolist(), strict=True)
         ]
-        stated = uncertainty(records[:4], records[4:], 0.25)
+        stated = uncertainty(CONFIG, records[:4], records[4:], 0.25)
         found.append(np.square(stated["noise_std_deg"]))
     np.testing.assert_allclose(np.sqrt(np.mean(found, axis=0)), sigma, rtol=0.15)
 

@@ -66,7 +66,7 @@ def test_a_full_disk_leaves_whole_lines(tmp_path, monkeypatch):
     real = os.write
 
     def full(fd, data):
-        if fd == journal._lines._fd and len(data) > 10:
+        if fd == journal._fd and len(data) > 10:
             return real(fd, data[:10])
         raise OSError(28, "No space left on device")
 
