@@ -18,7 +18,6 @@ from rig.config import ConfigError, RigConfig
 from rig.drives import named
 from rig.identification.conclusion import fit_quietly, spread
 from rig.journal.run_folder import Record
-from rig.outputs.messages import recalibrate
 from rig.readings.geometry import RADIAN, geometry_of
 
 if TYPE_CHECKING:
@@ -99,35 +98,21 @@ class DeviceModel:
         return {key: spread(measured - of[key].predict(commands)) for key in of}
 
     def conclude(
-        self,
-        config: RigConfig,
-        postures: dict[str, Record],
-        notes: Record,
-        told: Record,
+        self, config: RigConfig, postures: dict[str, Record]
     ) -> tuple[Any, Record]:
-        """The calibration, with ``notes`` in its file, and its summary with what is
-        ``told`` of any session."""
+        """The calibration, and what the summary has of it."""
         chosen, held = (
             [record for record in postures.values() if record["role"] == role]
             for role in ("select", "held")
         )
         calibration = self.identify(config, chosen)
-        errors = self.held_out_errors(config, calibration, held)
-        verdict = calibration.verdict
-        summary = told | errors | {
+        verdict, noise = calibration.verdict, calibration.noise_std
+        return calibration, self.held_out_errors(config, calibration, held) | {
             "model": calibration.model.title,
             "parameters": parameters(calibration),
-            "noise_std_deg": np.ravel(calibration.noise_std).tolist()
-            if calibration.noise_std is not None else None,
+            "noise_std_deg": None if noise is None else np.ravel(noise).tolist(),
             "fit": {"good": bool(verdict.good), "reasons": list(verdict.reasons)},
-        }  # fmt: skip
-        reasons = recalibrate(summary, config.session.verify_limit_deg)
-        mispairing = calibration.mispairing
-        if mispairing is not None and mispairing.reason not in reasons:
-            reasons.insert(0, mispairing.reason)
-        notes |= {"verdict": {"good": not reasons, "reasons": reasons}}
-        provenance = {**calibration.provenance, "notes": notes}
-        return dataclasses.replace(calibration, provenance=provenance), summary
+        }
 
 
 def parameters(calibration: Any) -> dict[str, Record]:

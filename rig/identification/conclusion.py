@@ -51,7 +51,6 @@ def identify_affine(
     config: RigConfig,
     records: list[Record],
     noise_std: Array | None = None,
-    notes: Record | None = None,
     zero_share: float = 0.0,
 ) -> Any:
     """Slopes A and bias b of ``y = A u + b`` from posture records: a ``Calibration``.
@@ -60,7 +59,7 @@ def identify_affine(
     variance of the zero posture's mean over that of another's, which shifts every
     posture equally and so adds to the variance of the bias.
     """
-    fitted = fit_quietly(config, *pairs(records), noise_std=noise_std, notes=notes)
+    fitted = fit_quietly(config, *pairs(records), noise_std=noise_std)
     if noise_std is None:
         return fitted
     covariance = np.array(fitted.joint_covariance)
@@ -212,7 +211,7 @@ def conclude(
         "device": config.device_fingerprint(),
         "postures": [record["name"] for record in chosen],
     }
-    told = {
+    summary = {
         "schema": 1,
         "measured_at": zero["time"],
         "axes": list(config.axis_names),
@@ -221,34 +220,34 @@ def conclude(
         "drift": drift,
         **shared,
     }
+    if model is not None:
+        calibration, result = model.conclude(config, postures)
+        mispairing = calibration.mispairing
+    else:
+        first = identify_affine(config, chosen)
+        held_out, errors = held_out_errors(config, held, postures, first)
+        if not compensated:
+            errors.pop("after", None)
+        # The noise is that which the held-out postures show.
+        zero_share = chosen[0]["samples"] / zero["samples"]
+        limits = uncertainty(config, chosen, held_out, zero_share)
+        in_order = sorted([*chosen, *held_out], key=lambda record: record["seq"])
+        mispairing = identify_affine(config, in_order).mispairing
+        noise = np.maximum(1e-9, limits["noise_std_deg"])
+        calibration = identify_affine(config, chosen, noise, zero_share)
+        matrix, bias = np.asarray(calibration.matrix), np.asarray(calibration.bias)
+        result = {"A": matrix.tolist(), "b": bias.tolist(), **limits, **errors}
+    summary |= result
+    reasons = recalibrate(summary, config.session.verify_limit_deg)
+    if mispairing is not None and mispairing.reason not in reasons:
+        reasons.insert(0, mispairing.reason)
     notes |= {
         "approach_overshoot_deg": config.motion.approach_overshoot_deg,
         **shared,
+        "verdict": {"good": not reasons, "reasons": reasons},
     }
-    if model is not None:
-        return model.conclude(config, postures, notes, told)
-    first = identify_affine(config, chosen)
-    held_out, errors = held_out_errors(config, held, postures, first)
-    if not compensated:
-        errors.pop("after", None)
-    # The noise is that which the held-out postures show.
-    zero_share = chosen[0]["samples"] / zero["samples"]
-    limits = uncertainty(config, chosen, held_out, zero_share)
-    in_order = sorted([*chosen, *held_out], key=lambda record: record["seq"])
-    mispairing = identify_affine(config, in_order).mispairing
-    reasons = [mispairing.reason] if mispairing else []
-    limit = config.session.verify_limit_deg
-    reasons += recalibrate({**errors, "drift": drift}, limit)
-    notes["verdict"] = {"good": not reasons, "reasons": reasons}
-    noise = np.maximum(1e-9, limits["noise_std_deg"])
-    calibration = identify_affine(config, chosen, noise, notes, zero_share)
-    return calibration, {
-        **told,
-        "A": np.asarray(calibration.matrix).tolist(),
-        "b": np.asarray(calibration.bias).tolist(),
-        **limits,
-        **errors,
-    }
+    provenance = {**calibration.provenance, "notes": notes}
+    return dataclasses.replace(calibration, provenance=provenance), summary
 
 
 def check_matrix(config: RigConfig, matrix: ArrayLike) -> list[str]:
