@@ -194,7 +194,9 @@ class Receiver(Source):
         self._port = settings.port
         self._closing = threading.Event()
         self._listener: socket.socket | None = None  # where this computer is called
-        self._thread = threading.Thread(target=self.receive, daemon=True)
+        self._thread = threading.Thread(
+            target=self.receive, name=self.table, daemon=True
+        )
 
     @abc.abstractmethod
     def receive(self) -> None:
