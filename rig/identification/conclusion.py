@@ -237,10 +237,8 @@ def conclude(
         calibration = identify_affine(config, chosen, noise, zero_share)
         matrix, bias = np.asarray(calibration.matrix), np.asarray(calibration.bias)
         result = {"A": matrix.tolist(), "b": bias.tolist(), **limits, **errors}
-    summary |= result
+    summary |= result | {"mispairing": mispairing and mispairing.reason}
     reasons = recalibrate(summary, config.session.verify_limit_deg)
-    if mispairing is not None and mispairing.reason not in reasons:
-        reasons.insert(0, mispairing.reason)
     notes |= {
         "approach_overshoot_deg": config.motion.approach_overshoot_deg,
         **shared,

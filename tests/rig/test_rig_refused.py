@@ -24,6 +24,7 @@ from rig.journal import lock
 from rig.journal.device import HOMED, STOP_PROVED
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import Journal
+from rig.outputs.messages import summary_lines
 from rig.procedures.calibrate import collect
 
 BAD = '\n[session]\nmethod = "exact"\nverify_postures = 1\nverify_limit_deg = 0.001\n'
@@ -72,6 +73,25 @@ def test_visits_are_taken_in_the_order_of_the_journal(tmp_path):
     ]
     _, told = conclude(config, back, {})
     assert told["drift"]["minutes"][-1] < 0  # as recorded, and still the last
+
+
+def test_readings_that_are_a_posture_late_are_told_by_verdict_and_notes(tmp_path):
+    config = parse_config(fast_text({}, BAD.replace("= 1\n", "= 8\n")))
+    with simulator(config) as sim:
+        assert session(sim.start(), tmp_path, sim) == 1
+    records = Journal(tmp_path / "journal.jsonl").records
+    rows = [r for r in records if r.get("role") in ("select", "before", "after")]
+    late = {
+        b["seq"]: {name: a[name] for name in ("attitude", "measured_deg")}
+        for a, b in zip(rows[4:], rows[5:], strict=False)
+    }
+    records = [{**record, **late.get(record["seq"], {})} for record in records]
+    config = changed(config, session=changed(config.session, verify_limit_deg=99.0))
+    calibration, told = conclude(config, records, {})
+    (reason,) = calibration.provenance["notes"]["verdict"]["reasons"]
+    assert "late" in reason
+    said = summary_lines(told, 99.0)[-1]
+    assert said.startswith(f"RECALIBRATE: {reason}. Do not use")
 
 
 def test_stop_names_the_devices_that_it_did_not_stop(tmp_path, monkeypatch, capsys):
