@@ -100,6 +100,8 @@ class StopConfig:
 
 def read_file(path: pathlib.Path) -> StopConfig:
     """All that is of use in a configuration file; OSError where it cannot be opened."""
+    if path.exists() and not path.is_file():
+        raise OSError("it is no file")  # a pipe would never end
     faults: Faults = []
     data = tables_of(_decoded(path.read_bytes()), faults)
     return _read(_bus_table(data), _axes_of(data), path.parent, faults)

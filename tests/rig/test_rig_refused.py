@@ -1,5 +1,7 @@
 """What a device, a file or a calibration is refused for, and what is said of others."""
 
+import itertools
+
 import pytest
 from harness import (
     changed,
@@ -83,7 +85,7 @@ def test_readings_that_are_a_posture_late_are_told_by_verdict_and_notes(tmp_path
     rows = [r for r in records if r.get("role") in ("select", "before", "after")]
     late = {
         b["seq"]: {name: a[name] for name in ("attitude", "measured_deg")}
-        for a, b in zip(rows[4:], rows[5:], strict=False)
+        for a, b in itertools.pairwise(rows[4:])
     }
     records = [{**record, **late.get(record["seq"], {})} for record in records]
     config = changed(config, session=changed(config.session, verify_limit_deg=99.0))

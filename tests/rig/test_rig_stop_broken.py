@@ -280,11 +280,11 @@ def test_a_pipe_in_its_folder_is_not_waited_for(suffix, rig, folder):
     assert stopped(rig) == ALL
 
 
-def test_a_record_that_is_nested_deeply_does_not_keep_it(rig, folder):
-    folder.mkdir(mode=0o700)
-    _lock_of(rig).armed_path.write_text("[" * 100_000)
-    assert main(["stop", "--config", str(rig.path)]) == 0
-    assert stopped(rig) == ALL
+def test_a_pipe_in_place_of_the_file_is_not_waited_for(rig, tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe.toml")
+    assert main(["stop", "--config", str(tmp_path / "pipe.toml")]) == 3
+    said = capsys.readouterr()
+    assert "pipe.toml cannot be read: it is no file" in said.out + said.err
 
 
 SAYS = """
