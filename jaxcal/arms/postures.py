@@ -47,8 +47,6 @@ def postures(arm: Chain, count: int, *, seed: int = 0, **rules: Any) -> Array:
             the board fills 25 to 80 % of the picture.
         tilt: degrees that the board's face may be turned from the camera (45).
         floor: lowest height (z in the measuring frame) of joints and sockets.
-        approach: direction (x, y, z) of the tool's approach, from the last joint to the
-            tip, and the largest angle from it in degrees (60).
 
     Returns:
         (count, n) commands with the sensor's columns, in an order of little travel.
@@ -95,13 +93,11 @@ class ReachableSet:
         distance: Sequence[float] | None = None,
         tilt: float | None = None,
         floor: float | None = None,
-        approach: ArrayLike | None = None,
     ) -> None:
         if camera is None and getattr(arm.sensor, "picture", None) is not None:
             camera = arm.sensor.camera  # type: ignore[attr-defined]  # of a Board
         self.view = view_of(arm, camera, distance, tilt)
         self.floor = -np.inf if floor is None else float(numbers("floor", floor))
-        self.cone = None if approach is None else _cone(approach)
         if arm.sensor.joined:
             raise ValueError("use one sensor at a time: arm.measured_with(sensor)")
         self.near, self.allowed = near, allowed
@@ -155,27 +151,14 @@ class ReachableSet:
             far = np.linalg.norm(points[:, None] - self.targets[:, :3], axis=-1)
             close = (far <= self.targets[:, 3]).any(axis=1)
             reasons = ["" if one else "are not near" for one in close]
-        if self.floor > -np.inf or self.cone is not None:
-            stands = self._stands(commands)
-            reasons = [a or b for a, b in zip(reasons, stands, strict=True)]
+        if self.floor > -np.inf:
+            heights = arm.skeleton(commands)[..., 2]
+            heights[:, -1] += _SUNK * arm.length
+            last = heights.shape[1] - (not isinstance(arm.sensor, Socket))
+            below = (heights[:, 2:last] < self.floor).any(axis=1)
+            for i in np.flatnonzero(below):
+                reasons[i] = reasons[i] or "are below the floor"
         return commands, reasons
-
-    def _stands(self, commands: Array) -> Array:
-        """(N,) why the arm may not stand at a posture, "" where it may."""
-        arm, points = self.arm, self.arm.skeleton(commands)
-        why = np.full(len(points), "", dtype=object)
-        if self.cone is not None:
-            way = points[:, -1] - points[:, -2]
-            size = np.linalg.norm(way, axis=1, keepdims=True)
-            axis = arm.nominal_tip(commands).rotation[:, :, 2]
-            far = size > 0.01 * (arm.length or 1.0)
-            way = np.where(far, way / (size + 1e-300), axis)
-            least = np.cos(np.radians(self.cone[3]))
-            why[way @ self.cone[:3] < least] = "approach from another direction"
-        points[:, -1, 2] += _SUNK * arm.length
-        last = len(points[0]) - (not isinstance(arm.sensor, Socket))
-        why[(points[:, 2:last, 2] < self.floor).any(axis=1)] = "are below the floor"
-        return why
 
     def drawn(self, count: int, seed: int) -> Array:
         """(count, n) commands from random starts, in an order of little travel."""
@@ -260,19 +243,6 @@ class ReachableSet:
 
 def _counted(reasons: Counter[str]) -> str:
     return ", ".join(f"{number} {reason}" for reason, number in reasons.most_common())
-
-
-def _cone(approach: ArrayLike) -> Array:
-    """(4,) unit direction and the largest angle from it, 60 degrees if not given."""
-    cone = numbers("approach", approach)
-    cone = np.append(cone, 60.0) if cone.shape == (3,) else cone
-    size = np.linalg.norm(cone[:3])
-    if cone.shape != (4,) or not (size > 0.0 and 0.0 < cone[3] <= 180.0):
-        raise ValueError(
-            "approach must be a direction (x, y, z) and the largest angle from it in "
-            f"degrees, got {in_words(numbers('approach', approach))}"
-        )
-    return np.append(cone[:3] / size, cone[3])
 
 
 def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:

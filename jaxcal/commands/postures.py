@@ -51,11 +51,6 @@ class PostureOptions:
     ] = None
 
     floor: Annotated[float | None, "lowest allowed height of a joint"] = None
-    approach: Annotated[
-        list[float] | None,
-        "the tool's approach: direction and largest angle from it: 0,0,-1,60",
-        several(float, "numbers"),
-    ] = None
 
     def with_board(self, arm: SerialChain) -> SerialChain:
         """The arm whose board is of this width and height, if they are given."""
@@ -99,7 +94,7 @@ def postures(
     The postures lie within the joint limits, where the sensor reads, and are chosen for
     accurate predictions of the calibrated arm. With --measured the remaining postures
     complement those already measured, which also locate sockets, planes and boards.
-    Collisions are checked only by --floor and --approach.
+    Collisions are checked only by --floor.
     """
     if picture:
         with needs("plots", "--picture"):
@@ -129,7 +124,6 @@ def postures(
         distance=of_postures.away,
         tilt=of_postures.tilt,
         floor=of_postures.floor,
-        approach=of_postures.approach,
     )
     design = Design(offered, model=arm, measured=done)
     chosen = design.select(more, method="exchange").indices

@@ -104,26 +104,21 @@ def test_a_board_without_corners_takes_a_camera_for_its_postures():
         Board("camera", PLACE, camera=(640.0, 480.0))
 
 
-def test_contacts_on_a_table_come_from_above_it():
+def test_contacts_on_a_table_keep_the_arm_above_it():
     arm = ur5(sensor=Socket(2))
     plain = arm.postures(60, near=NEAR)
-    safe = arm.postures(60, near=NEAR, floor=0.0, approach=(0, 0, -1, 60))
+    safe = arm.postures(60, near=NEAR, floor=0.0)
 
     def heights(commands):
-        """(N, 5) heights of the ends of links 2 to 5, and how steep the tool comes."""
+        """(N,) of the lowest of the ends of links 2 to 5."""
         tips = [
             _frames(_cut(arm, n), commands[:, :n], _cut(arm, n).nominal)
             for n in (2, 3, 4, 5)
         ]
-        whole = _frames(arm, commands[:, :6], arm.nominal)
-        way = whole[:, :3, 3] - tips[-1][:, :3, 3]
-        low = np.min([frame[:, 2, 3] for frame in tips], axis=0)
-        return low, way[:, 2] / np.linalg.norm(way, axis=1)
+        return np.min([frame[:, 2, 3] for frame in tips], axis=0)
 
-    low, steep = heights(plain)
-    assert (low < 0.0).mean() > 0.3 and (steep > 0.0).mean() > 0.3
-    low, steep = heights(safe)
-    assert (low > -1e-6).all() and (steep < -0.49).all()
+    assert (heights(plain) < 0.0).mean() > 0.3
+    assert (heights(safe) > -1e-6).all()
 
 
 def _cut(arm, links):
@@ -148,7 +143,6 @@ def test_wrong_rooms_and_views_are_named():
         ({"camera": CAMERA}, "camera needs an arm with sensor=Board"),
         ({"tilt": 100.0}, "tilt needs camera=.*got 100"),
         ({"distance": (0.2, 0.5)}, "distance needs camera="),
-        ({"approach": (0, 0, 0)}, "approach must be a direction"),
         ({"floor": 0.45}, r"no posture reaches near = .* are below the floor"),
     ):
         with pytest.raises(ValueError, match=why):
