@@ -14,15 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxcal.calibration.pairing.benign import BEFORE, SESSIONS, benign_fits
 from jaxcal.calibration.pairing.fit import (
+    BEFORE,
     FOREIGN,
+    SESSIONS,
     ColumnChange,
     Fitted,
     Hypothesis,
     Rows,
     Table,
     as_it_is,
+    benign_fits,
     fits_of,
     fitted,
     path_match,

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.calibration.pairing.benign import benign_fits
-from jaxcal.calibration.pairing.fit import as_it_is, fitted, predicted
+from jaxcal.calibration.pairing.fit import as_it_is, benign_fits, fitted, predicted
 from jaxcal.calibration.pairing.judge import (
     LEAST,
     RATIO,
