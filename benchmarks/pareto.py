@@ -19,7 +19,7 @@ import numpy as np
 from jaxcal.designs.travel import Motion, fastest_tour, travel_times
 from jaxcal.designs.travel.search import ParetoFront
 from jaxcal.reports import plots
-from jaxcal.reports.plots.style import panels
+from jaxcal.reports.plots import panels
 from jaxcal.selection import Design, select
 
 MOTION = Motion(speed=(20.0,), acceleration=(100.0,), settle=1.0)

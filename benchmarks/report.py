@@ -120,7 +120,7 @@ def write(folder: pathlib.Path, results: dict[str, dict[str, Any]]) -> None:
 
 def overview(results: dict[str, dict[str, Any]]) -> Any:
     """How far every promise is kept: a mark each, achieved over wanted."""
-    from jaxcal.reports.plots.style import COLOURS, panels
+    from jaxcal.reports.plots import COLOURS, panels
 
     rows = [row for row in results.values() if row["verdicts"] and not row["quick"]]
     figure, axes = panels((6.4, 0.9 + 0.34 * len(rows)))

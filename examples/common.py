@@ -69,7 +69,7 @@ def picture(name: str) -> Any:
 
 
 def _figure(example: ModuleType, rows: Rows) -> Any:
-    from jaxcal.reports.plots.style import panels
+    from jaxcal.reports.plots import panels
 
     count = getattr(example, "PANELS", 1)
     figure, axes = panels((7.4 if count > 1 else 6.4, 3.8), shape=(1, count))
@@ -98,7 +98,7 @@ def row(cells: dict[str, object], names: Iterable[str], values: Any, form: str) 
 
 def bars(axes: Any, rows: Rows, name: str, value: str, label: str) -> None:
     """One bar a row."""
-    from jaxcal.reports.plots.style import COLOURS
+    from jaxcal.reports.plots import COLOURS
 
     axes.bar([r[name] for r in rows], [float(r[value]) for r in rows], color=COLOURS[0])
     axes.tick_params(axis="x", rotation=20)
@@ -107,7 +107,7 @@ def bars(axes: Any, rows: Rows, name: str, value: str, label: str) -> None:
 
 def curves(axes: Any, rows: Rows, name: str, k: str, value: str, label: str) -> None:
     """One curve a name, against the number of measurements."""
-    from jaxcal.reports.plots.style import numbered
+    from jaxcal.reports.plots import numbered
 
     for i, each in enumerate(dict.fromkeys(r[name] for r in rows)):
         points = [(int(r[k]), float(r[value])) for r in rows if r[name] == each]

@@ -79,7 +79,7 @@ def rows(found: dict[tuple[str, float], float]) -> common.Rows:
 
 def draw(axes, rows: common.Rows) -> None:
     """Share seen against the size of the change."""
-    from jaxcal.reports.plots.style import numbered
+    from jaxcal.reports.plots import numbered
 
     for i, plan in enumerate(PLANS):
         points = [(float(r["change_mm"]), float(r["seen"])) for r in rows

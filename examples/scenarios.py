@@ -78,7 +78,7 @@ def rows(found: dict[str, np.ndarray]) -> common.Rows:
 
 
 def draw(axes, rows: common.Rows) -> None:
-    from jaxcal.reports.plots.style import numbered
+    from jaxcal.reports.plots import numbered
 
     at = [float(row["true middle"]) for row in rows]
     for i, rule in enumerate(list(rows[0])[1:]):

@@ -110,7 +110,7 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
 
 def draw(axes, rows: common.Rows) -> None:
     """Nats less those of ``ahead``, with 95 % intervals; ``gain`` is far below."""
-    from jaxcal.reports.plots.style import COLOURS
+    from jaxcal.reports.plots import COLOURS
 
     for row in (row for row in rows if row["method"] != "gain"):
         axes.errorbar(

@@ -142,7 +142,7 @@ def rows(found: dict[str, np.ndarray]) -> common.Rows:
 
 def draw(axes, rows: common.Rows) -> None:
     """Errors by parameter."""
-    from jaxcal.reports.plots.style import COLOURS
+    from jaxcal.reports.plots import COLOURS
 
     at = np.arange(len(rows))
     for i, rule in enumerate(("random", "chosen")):

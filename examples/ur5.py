@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 import jaxcal
 from jaxcal.models import SerialChain
 from jaxcal.progress import Progress
-from jaxcal.reports.plots.style import plain_log
+from jaxcal.reports.plots import plain_log
 
 Array = NDArray[np.float64]
 

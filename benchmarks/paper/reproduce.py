@@ -131,7 +131,7 @@ def _files(
 ) -> dict[str, bytes]:
     """Everything to write, by path below the folder; the page last."""
     from benchmarks.paper.exhibits.page import json_document, page
-    from jaxcal.reports.plots.style import as_files
+    from jaxcal.reports.plots import as_files
     from jaxcal.tables import csv_text
 
     figures = {name: f for e in exhibits for name, f in e.figures.items()}

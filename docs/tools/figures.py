@@ -23,7 +23,7 @@ import jaxcal
 from benchmarks import report
 from jaxcal.models import SerialChain
 from jaxcal.reports import plots
-from jaxcal.reports.plots.style import COLOURS, GREY, as_bytes, numbered, panels
+from jaxcal.reports.plots import COLOURS, GREY, as_bytes, numbered, panels
 
 
 def four_of_fifty() -> Figure:

@@ -11,7 +11,7 @@ import base64
 import re
 from typing import Any
 
-from jaxcal.reports.plots.style import as_bytes
+from jaxcal.reports.plots import as_bytes
 
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.M | re.S)
 DRAWN = re.compile(r"((?!axes\b|[\w, ]+ = )[^#]*\.plot\([^#]*\))(\s+#.*)?")

@@ -266,7 +266,7 @@ def seconds_a_choice(task: Any, decider: Any, seed: int) -> float:
 def decider_figures(evaluation: DeciderEvaluation) -> dict[str, Any]:
     """Mean nats by method, and less those of the rival in pairs, 95 % intervals."""
     from jaxcal.evaluation.figures import intervals, styles_of
-    from jaxcal.reports.plots.style import GREY, panels
+    from jaxcal.reports.plots import GREY, panels
 
     results, rival = evaluation.results, evaluation.rival
     names = [result.method for result in results]

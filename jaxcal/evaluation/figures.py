@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 
 from jaxcal.checks import Array
 from jaxcal.evaluation.methods import PostureEvaluation, PostureResult, log_mean
-from jaxcal.reports.plots.style import (
+from jaxcal.reports.plots import (
     BLACK,
     COLOURS,
     GREY,

@@ -171,7 +171,7 @@ def _drawn(
     figures: Mapping[str, Any], files: dict[str, bytes], prefix: str = ""
 ) -> list[Block]:
     """Figures of a page; their files are added to those that are given."""
-    from jaxcal.reports.plots.style import as_files
+    from jaxcal.reports.plots import as_files
 
     blocks: list[Block] = []
     for name, figure in ((prefix + name, figures[name]) for name in figures):

@@ -372,7 +372,7 @@ def _scatter(
 ) -> bytes:
     """An SVG file: the columns (N, s) as dots, a panel for each of ``across`` (N,)."""
     with needs("plots", "a report"):
-        from jaxcal.reports.plots.style import BLACK, as_bytes, panels, points
+        from jaxcal.reports.plots import BLACK, as_bytes, panels, points
     shape = (-(-len(across) // 2), min(len(across), 2))
     figure, axes = panels((8.0, 2.6 * shape[0]), "", shape, sharey=True, squeeze=False)
     for panel, (name, x) in zip(axes.flat, across.items(), strict=False):

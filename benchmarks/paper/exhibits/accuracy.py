@@ -27,7 +27,7 @@ from benchmarks.paper.exhibits.study import Study, commands_deg
 from jaxcal.evaluation.methods import least_squares, predict
 from jaxcal.information.regression import regressors
 from jaxcal.paper.datasets import NOISE_STD_DEG
-from jaxcal.reports.plots.style import BLACK, band, numbered, panels, plain_log
+from jaxcal.reports.plots import BLACK, band, numbered, panels, plain_log
 from jaxcal.selection import exchange_batch
 
 Array = NDArray[np.float64]

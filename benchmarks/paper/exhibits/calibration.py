@@ -17,7 +17,7 @@ from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.methods import least_squares, predict
 from jaxcal.models import Affine
 from jaxcal.paper.datasets import AXES, BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
-from jaxcal.reports.plots.style import BLACK, COLOURS, boxes, legend_right, panels
+from jaxcal.reports.plots import BLACK, COLOURS, boxes, legend_right, panels
 
 Array = NDArray[np.float64]
 

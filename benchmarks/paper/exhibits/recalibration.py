@@ -25,7 +25,7 @@ from benchmarks.paper.exhibits.intervals import (
 from benchmarks.paper.exhibits.study import Study, choose
 from jaxcal.evaluation.methods import least_squares, predict
 from jaxcal.paper.datasets import AXES, NOISE_STD_DEG, RANGES
-from jaxcal.reports.plots.style import (
+from jaxcal.reports.plots import (
     BLACK,
     COLOURS,
     GREY,

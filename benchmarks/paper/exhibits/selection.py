@@ -17,7 +17,7 @@ from benchmarks.paper.exhibits.intervals import (
 from benchmarks.paper.exhibits.study import Settings, Study
 from jaxcal.evaluation import figures
 from jaxcal.evaluation.methods import HIT_TOLERANCE, PostureEvaluation
-from jaxcal.reports.plots.style import BLACK, COLOURS, legend_right, panels
+from jaxcal.reports.plots import BLACK, COLOURS, legend_right, panels
 
 Array = NDArray[np.float64]
 

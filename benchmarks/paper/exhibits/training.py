@@ -24,7 +24,7 @@ from jaxcal.evaluation.figures import (
     read_metrics,
     training_curves,
 )
-from jaxcal.reports.plots.style import COLOURS, GREY, band, boxes, panels
+from jaxcal.reports.plots import COLOURS, GREY, band, boxes, panels
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from benchmarks.paper.exhibits.selection import STREAM, words_of
 from benchmarks.paper.exhibits.study import METHODS, Study
 from jaxcal.evaluation import figures
 from jaxcal.models import Affine
-from jaxcal.reports.plots.style import BLACK, COLOURS, GREY
+from jaxcal.reports.plots import BLACK, COLOURS, GREY
 
 Array = NDArray[np.float64]
 
