@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import IO, Any
 
+AnyPath = str | os.PathLike[str]
 _WRITTEN = {"out", "servos_out", "picture", "json"}  # arguments that are files
 _SHOWN = "/dev/stdout"  # where the shell has redirected it, that file
 _RECORDS = {".json", ".jsonl", ".toml", ".csv"}

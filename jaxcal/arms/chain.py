@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.arguments import (
     joint_kinds,
@@ -28,8 +27,9 @@ from jaxcal.arms.sensors import Position, Sensor, Several
 from jaxcal.arms.sensors.sensor import plain_fields
 from jaxcal.arms.sensors.several import OneTable, stacked
 from jaxcal.checks import Array, array_of, axis_names, numbers, one_of
+from jaxcal.files import AnyPath
 from jaxcal.late import late
-from jaxcal.models.model import Model, Quantity, as_commands, as_parameters
+from jaxcal.models.model import Model, Quantity, Rows, Theta, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise
 
 
@@ -176,7 +176,7 @@ class SerialChain(Arm, Model):
     @classmethod
     def from_urdf(
         cls,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         *,
         base: str | None = None,
         tip: str | None = None,
@@ -206,11 +206,7 @@ class SerialChain(Arm, Model):
 
     @classmethod
     def from_ur_kinematics(
-        cls,
-        path: str | os.PathLike[str],
-        *,
-        sensor: Sensor | None = None,
-        **options: Any,
+        cls, path: AnyPath, *, sensor: Sensor | None = None, **options: Any
     ) -> Self:
         """The arm of a kinematics file of Universal Robots' ROS description, in metres.
 
@@ -282,7 +278,7 @@ class SerialChain(Arm, Model):
     def sensed(self) -> slice:
         return slice(self.num_joints, self.num_inputs)
 
-    def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
+    def distinct(self, commands: Array, measured: Array) -> Rows:
         kept = [np.zeros(0, dtype=np.intp)]
         for _, one, rows, _ in self.sensor.parts(commands[:, self.num_joints :]):
             if one.zeros and not measured[rows].any():
@@ -382,15 +378,11 @@ class SerialChain(Arm, Model):
             dict.fromkeys(q.unit for quantities in of_each for q in quantities)
         )
 
-    def predict(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         return self._reading(commands, theta).values.copy()
 
-    def jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         columns, by_sensor = self._motion(commands, theta, self._steps_of_parameters)
         at, own = self._at, self._at["sensor"].start
@@ -407,9 +399,7 @@ class SerialChain(Arm, Model):
         result[..., at["harmonics"]] *= waves[:, None]
         return result
 
-    def command_jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, n), zero by the sensor's columns; of a pose, with the orientation that
         it is compared with held."""
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
@@ -426,7 +416,7 @@ class SerialChain(Arm, Model):
     def wrapped(self, off: Array, commands: Array) -> Array:
         return self.sensor.wrapped(off, commands[:, self.num_joints :], self.length)
 
-    def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
+    def facts(self, parameters: Theta = None) -> tuple[Array, Array]:
         theta, at = as_parameters(self, parameters), self._at["sensor"]
         off, rows = self.sensor.facts(theta[at])
         slopes = np.zeros((len(off), len(theta)))
@@ -452,7 +442,7 @@ class SerialChain(Arm, Model):
 
     def targets(
         self, desired: Array, start: Array | None
-    ) -> Callable[[Array, NDArray[np.intp]], Array]:
+    ) -> Callable[[Array, Rows], Array]:
         """What to reach; of a pose its turns from the nominal orientation there."""
         if not self.relative:
             return super().targets(desired, start)
@@ -463,7 +453,7 @@ class SerialChain(Arm, Model):
             )
         turned = self.rotations(start, desired[:, 3:])
 
-        def goal(commands: Array, rows: NDArray[np.intp]) -> Array:
+        def goal(commands: Array, rows: Rows) -> Array:
             turns = self.rotation_vectors(commands, turned[rows])
             return np.hstack([desired[rows, :3], turns])
 

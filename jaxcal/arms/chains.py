@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, Self
 
@@ -19,8 +18,16 @@ from jaxcal.arms.sensors import Sensor
 from jaxcal.arms.sensors.sensor import BASE, Readings, label
 from jaxcal.arms.sensors.several import OneTable, stacked
 from jaxcal.checks import Array, one_of
+from jaxcal.files import AnyPath
 from jaxcal.late import late
-from jaxcal.models.model import ErrorGroups, Model, as_commands, as_parameters
+from jaxcal.models.model import (
+    ErrorGroups,
+    Model,
+    Rows,
+    Theta,
+    as_commands,
+    as_parameters,
+)
 from jaxcal.models.uncertainty import Noise, Prior
 
 
@@ -86,7 +93,7 @@ class Chains(Model):
     @classmethod
     def from_urdf(
         cls,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         sensors: Mapping[str, Sensor],
         *,
         base: str | None = None,
@@ -232,9 +239,7 @@ class Chains(Model):
             return self
         return dataclasses.replace(self, chains=arms)
 
-    def _parts(
-        self, commands: Array
-    ) -> Iterator[tuple[int, SerialChain, NDArray[np.intp], Array]]:
+    def _parts(self, commands: Array) -> Iterator[tuple[int, SerialChain, Rows, Array]]:
         """Each chain that was read and its number, its rows, its commands there."""
         which = label("chain", commands[:, len(self.joint_names)], len(self.chains))
         for k in np.unique(which).tolist():
@@ -314,7 +319,7 @@ class Chains(Model):
             with self._naming(k):
                 arm.require_commands(arm_commands)
 
-    def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
+    def distinct(self, commands: Array, measured: Array) -> Rows:
         counting = [
             rows[arm.distinct(arm_commands, measured[rows])]
             for _, arm, rows, arm_commands in self._parts(commands)
@@ -332,9 +337,7 @@ class Chains(Model):
         units = [np.array(arm.units, dtype=object) for arm in self.chains]
         return tuple(self._gather(units))
 
-    def predict(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """Readings (N, q) in noise, 0 beyond those of a row's sensor."""
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         values = np.zeros((len(commands), self.num_outputs))
@@ -343,18 +346,14 @@ class Chains(Model):
             values[rows, : arm.num_outputs] = read
         return values
 
-    def jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         return self._slopes("jacobian", commands, parameters, self.members)
 
-    def command_jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         return self._slopes("command_jacobian", commands, parameters, self._columns)
 
     def _slopes(
-        self, by: str, commands: ArrayLike, parameters: ArrayLike | None, at: Any
+        self, by: str, commands: ArrayLike, parameters: Theta, at: Any
     ) -> Array:
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         width = len(self.names) if by == "jacobian" else self.num_inputs
@@ -397,7 +396,7 @@ class Chains(Model):
             slopes[np.ix_(rows, at)] = of_arm
         return slopes
 
-    def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
+    def facts(self, parameters: Theta = None) -> tuple[Array, Array]:
         theta = as_parameters(self, parameters)
         offs, rows = [np.zeros(0)], [np.zeros((0, len(theta)))]
         for (k, i), *_ in self._members:  # a distance is known once

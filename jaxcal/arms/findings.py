@@ -6,7 +6,6 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.sensors import Socket, Wrench
@@ -14,6 +13,7 @@ from jaxcal.arms.sensors.sensor import Readings
 from jaxcal.calibration.reasons import Reason, in_rows
 from jaxcal.calibration.verdict import outlying
 from jaxcal.checks import Array
+from jaxcal.models.model import Rows
 
 if TYPE_CHECKING:
     from jaxcal.arms.effects import Fit
@@ -43,7 +43,7 @@ _ZERO = 10.0  # degrees: no zero of a joint is set so badly
 _SHOWN = 0.5  # of the prior's variance: less was removed, readings hardly show it
 
 
-def parts_of(fit: Fit, used: NDArray[np.intp]) -> list[Readings]:
+def parts_of(fit: Fit, used: Rows) -> list[Readings]:
     """Readings of each sensor that has some, of the rows ``used`` (K,)."""
     parts = [
         part._replace(rows=used[part.rows], title=part.kind)
@@ -61,7 +61,7 @@ def unit_after(fit: Fit) -> str:
 
 def findings_of(
     fit: Fit,
-    used: NDArray[np.intp],
+    used: Rows,
     parts: list[Readings],
     scatter: Reason | None,
     mistaken: str,
@@ -162,7 +162,7 @@ def left_open(
 
 def _wrong_rows(
     fit: Fit,
-    used: NDArray[np.intp],
+    used: Rows,
     parts: list[Readings],
     swapped: dict[int, int],
     outliers: list[int],

@@ -14,7 +14,7 @@ from jaxcal.arms.files.write import fixed_joint, with_origins
 from jaxcal.arms.sensors import Board
 from jaxcal.arms.verdict import place_of
 from jaxcal.checks import Array, one_of
-from jaxcal.files import write_over
+from jaxcal.files import AnyPath, write_over
 from jaxcal.models.uncertainty import Prior
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def static_transform(
 
 def to_transform(
     calibration: Calibration,
-    path: str | os.PathLike[str],
+    path: AnyPath,
     *,
     child: str | None = None,
     parent: str | None = None,

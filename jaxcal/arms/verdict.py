@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.chains import Chains
@@ -32,6 +31,7 @@ from jaxcal.calibration.reasons import Reason, computed, never_measured
 from jaxcal.calibration.verdict import left_out, wrong_noise
 from jaxcal.checks import Array, one_of
 from jaxcal.information.singular import depends, significant
+from jaxcal.models.model import Rows
 
 if TYPE_CHECKING:
     from jaxcal.arms.effects import Fit
@@ -277,7 +277,7 @@ def _mean(errors: Array) -> tuple[float, float]:
     return float(errors.mean()), float(half_width)
 
 
-def _nominal(fit: Fit, used: NDArray[np.intp], parts: list[Readings]) -> Array:
+def _nominal(fit: Fit, used: Rows, parts: list[Readings]) -> Array:
     """(N, q) errors of the nominal arm, of the rows ``used``."""
     commands, measured = fit.commands[used], fit.measured[used]
     model, off = fit.model, np.zeros_like(fit.residuals)
@@ -435,7 +435,7 @@ def verdict_of_chains(model: Chains, fit: Any) -> ChainsVerdict:
 
 
 def _shared_parts(
-    model: Chains, used: NDArray[np.intp], tables: list[tuple[int, Array, None]]
+    model: Chains, used: Rows, tables: list[tuple[int, Array, None]]
 ) -> list[Readings]:
     """What chains read of the sensors that they share, of the rows ``used``; distances
     that one chain's contacts judge are left to its own verdict."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -12,8 +11,7 @@ import numpy as np
 
 from jaxcal.calibration import Calibration
 from jaxcal.checks import Array
-
-Path = str | os.PathLike[str]
+from jaxcal.files import AnyPath
 
 
 def of(fit: Calibration, tip: str) -> Calibration:
@@ -25,7 +23,7 @@ def of(fit: Calibration, tip: str) -> Calibration:
     return dataclasses.replace(fit, **model.of_chain(fit, tip))
 
 
-def to_urdf(fit: Calibration, path: Path, *, force: bool = False) -> str:
+def to_urdf(fit: Calibration, path: AnyPath, *, force: bool = False) -> str:
     """Write the arm's own file, corrected; returns the tip link.
 
     Files cannot hold compliance (the arm is then moved as a whole to where its tip
@@ -35,20 +33,20 @@ def to_urdf(fit: Calibration, path: Path, *, force: bool = False) -> str:
     return str(_arm(fit).write("urdf", path, for_file(fit), force=force))
 
 
-def to_dh(fit: Calibration, path: Path, *, force: bool = False) -> None:
+def to_dh(fit: Calibration, path: AnyPath, *, force: bool = False) -> None:
     """Write the DH table as CSV, corrected as ``to_urdf`` says."""
     _arm(fit).write("dh", path, for_file(fit), force=force)
 
 
-def to_ur_kinematics(fit: Calibration, path: Path, *, force: bool = False) -> None:
+def to_ur_kinematics(fit: Calibration, path: AnyPath, *, force: bool = False) -> None:
     """Write Universal Robots' kinematics file, corrected as ``to_urdf`` says."""
     _arm(fit).write("ur", path, for_file(fit), force=force)
 
 
 def to_lerobot(
     fit: Calibration,
-    path: Path,
-    servos: Path,
+    path: AnyPath,
+    servos: AnyPath,
     *,
     names: Mapping[str, str] | None = None,
     force: bool = False,

@@ -17,14 +17,13 @@ from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for
 from jaxcal.calibration.verdict import Verdict, verdict
 from jaxcal.checks import aligned, in_words
+from jaxcal.files import AnyPath
 from jaxcal.late import late
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 
 if TYPE_CHECKING:
     from jaxcal.calibration.pairing import Mispairing
-
-Path = str | os.PathLike[str]
 
 
 class Calibration(Fit):
@@ -155,7 +154,7 @@ class Calibration(Fit):
     # -- from a file -------------------------------------------------------------------
 
     @classmethod
-    def load(cls, path: Path, *, model: Model | None = None) -> Calibration:
+    def load(cls, path: AnyPath, *, model: Model | None = None) -> Calibration:
         """Read a file that ``save`` wrote; ``model`` is needed if it contains a
         function, which files cannot hold. A ValueError names file and key."""
         content = file.read(path)

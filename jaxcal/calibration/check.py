@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.pairing import of_new_readings
 from jaxcal.checks import Array, array_of, by_unit, whole_number
+from jaxcal.files import AnyPath
 from jaxcal.information.blocks import without
 from jaxcal.models.model import recorded
 from jaxcal.models.recording import Recording
@@ -103,7 +103,7 @@ class Check:
 
 def check(
     calibration: Fit,
-    commands: ArrayLike | Recording | str | os.PathLike[str],
+    commands: ArrayLike | Recording | AnyPath,
     measured: ArrayLike | None = None,
     *,
     tolerance: float | Mapping[str, float] | None = None,

@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_problem import LOSSES
-from jaxcal.files import write_text
+from jaxcal.files import AnyPath, write_text
 from jaxcal.models.model import Model, as_model, from_dict
 
 FORMAT = "jaxcal-calibration"
@@ -58,12 +58,12 @@ def to_dict(fit: Fit) -> dict[str, Any]:
     return content
 
 
-def save(fit: Fit, path: str | os.PathLike[str]) -> None:
+def save(fit: Fit, path: AnyPath) -> None:
     """Write a versioned JSON file atomically; after an OSError the old one stays."""
     write_text(path, json.dumps(to_dict(fit), indent=1, allow_nan=False) + "\n")
 
 
-def read(path: str | os.PathLike[str]) -> Any:
+def read(path: AnyPath) -> Any:
     """The JSON of a file; a ValueError names the file."""
 
     def constant(text: str) -> NoReturn:

@@ -10,13 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.fit_problem import (
-    LOSSES,
-    FitProblem,
-    Loss,
-    constants,
-    singular,
-)
+from jaxcal.calibration.fit_problem import LOSSES, FitProblem, Loss, constants, singular
 from jaxcal.calibration.least_squares import FitSolution, solve
 from jaxcal.calibration.noise_levels import are_shared, pooled, with_levels_apart
 from jaxcal.calibration.prior_scales import (

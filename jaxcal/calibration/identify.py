@@ -7,7 +7,6 @@ import datetime
 import functools
 import hashlib
 import json
-import os
 import platform
 import sys
 import warnings
@@ -31,6 +30,7 @@ from jaxcal.checks import (
     require_size,
     table,
 )
+from jaxcal.files import AnyPath
 from jaxcal.models.linear import Affine
 from jaxcal.models.model import Model, recorded
 from jaxcal.models.recording import Recording
@@ -52,7 +52,7 @@ _affine = functools.lru_cache(Affine)
 
 
 def identify(
-    commands: ArrayLike | Recording | str | os.PathLike[str],
+    commands: ArrayLike | Recording | AnyPath,
     measured: ArrayLike | None = None,
     *,
     model: Model | None = None,

@@ -17,6 +17,7 @@ from jaxcal.information.singular import (
     significant,
 )
 from jaxcal.models.identifiability import unknown
+from jaxcal.models.model import Rows
 from jaxcal.models.predictions import derivative, predict
 from jaxcal.tables import limits_of_frame
 
@@ -268,7 +269,7 @@ class _Search(Responses):
             sides.insert(0, (fit.output_names, self.wanted, readings))
         say_far("target", fit.loss_weights > 0.0, sides, stacklevel=4)
 
-    def gap(self, commands: Array, rows: NDArray[np.intp]) -> Array:
+    def gap(self, commands: Array, rows: Rows) -> Array:
         """(R, q) of points ``rows`` from the outputs at ``commands``, in sizes."""
         off = self.goal(commands, rows) - self.outputs(commands)
         return np.asarray(self.model.wrapped(off, commands) / self.size)

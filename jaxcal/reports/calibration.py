@@ -23,7 +23,7 @@ from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.verdict import left_out
 from jaxcal.checks import Array
 from jaxcal.extras import needs
-from jaxcal.files import write_text
+from jaxcal.files import AnyPath, write_text
 from jaxcal.models.model import Quantity
 from jaxcal.reports import page as pages
 from jaxcal.reports.budget import Budget, Source, budget
@@ -78,13 +78,13 @@ def moved(calibration: Fit, before: Fit) -> list[dict[str, Any]]:
 
 def report(
     calibration: Calibration,
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     *,
     check: Check | None = None,
     readings: tuple[ArrayLike, ArrayLike] | None = None,
     before: Fit | None = None,
     sources: Sequence[Source] = (),
-    files: Sequence[str | os.PathLike[str]] = (),
+    files: Sequence[AnyPath] = (),
 ) -> bool:
     """Write ``index.html``, ``calibration.json`` and ``verdict.json`` into a folder.
 

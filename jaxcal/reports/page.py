@@ -9,13 +9,12 @@ from __future__ import annotations
 import base64
 import dataclasses
 import functools
-import os
 import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from jaxcal.extras import needs
-from jaxcal.files import write_text
+from jaxcal.files import AnyPath, write_text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,7 +162,7 @@ def template(
     return environment.get_template(path.name)
 
 
-def write_page(path: str | os.PathLike[str], page: Page) -> None:
+def write_page(path: AnyPath, page: Page) -> None:
     """Write the page atomically.
 
     Raises:

@@ -185,10 +185,7 @@ def plan(axes: Any, plan: Any) -> Any:
 
 
 def before_after(
-    axes: Any,
-    errors: dict[str, ArrayLike],
-    names: Sequence[str] = (),
-    unit: str = "",
+    axes: Any, errors: dict[str, ArrayLike], names: Sequence[str] = (), unit: str = ""
 ) -> Any:
     """Errors of each output side by side, such as raw and calibrated.
 
@@ -219,10 +216,7 @@ def before_after(
 
 
 def residuals(
-    axes: Any,
-    values: ArrayLike,
-    names: Sequence[str] = (),
-    unit: str = "",
+    axes: Any, values: ArrayLike, names: Sequence[str] = (), unit: str = ""
 ) -> Any:
     """Measured less fitted, in the order of measurement.
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.checks import Array, in_words, numbers
 from jaxcal.extras import needs
-from jaxcal.files import write_over
+from jaxcal.files import AnyPath, write_over
 from jaxcal.models.model import as_parameters
 from jaxcal.models.recording import Recording
 
@@ -29,11 +29,7 @@ _STATES = "sensor_msgs/msg/JointState"
 
 
 def at_rest(
-    arm: Chain,
-    path: str | os.PathLike[str],
-    *,
-    seconds: float = 0.5,
-    within: float | None = None,
+    arm: Chain, path: AnyPath, *, seconds: float = 0.5, within: float | None = None
 ) -> Array:
     """Postures (N, J) at which a recorded arm stood still, in their order.
 
@@ -347,7 +343,7 @@ class Servos:
                 )
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], resolution: int = 4096) -> Self:
+    def load(cls, path: AnyPath, resolution: int = 4096) -> Self:
         """Read the file that ``lerobot-calibrate`` wrote."""
         try:
             content = json.loads(pathlib.Path(path).read_text(encoding="utf-8-sig"))
@@ -357,7 +353,7 @@ class Servos:
         except ValueError as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from None
 
-    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+    def save(self, path: AnyPath, *, force: bool = False) -> None:
         """Write the file that LeRobot reads; over one that is there with ``force``."""
         content = {name: dict(motor) for name, motor in self.motors.items()}
         write_over(path, json.dumps(content, indent=4) + "\n", force)
@@ -411,9 +407,9 @@ class Servos:
 
 def write_servos(
     arm: Chain,
-    path: str | os.PathLike[str],
+    path: AnyPath,
     parameters: ArrayLike,
-    servos: str | os.PathLike[str],
+    servos: AnyPath,
     names: Mapping[str, str],
     *,
     force: bool = False,

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxcal.checks import Array, numbers, one_of
+from jaxcal.files import AnyPath
 
 _PARALLEL = 0.2  # sine; below it the common normal of two axes is far away
 
@@ -39,10 +40,7 @@ _KINDS = {"revolute": "R", "continuous": "R", "prismatic": "P", "fixed": ""}
 
 
 def read_urdf(
-    path: str | os.PathLike[str],
-    tip: str | None,
-    base: str | None,
-    locked: Mapping[str, float],
+    path: AnyPath, tip: str | None, base: str | None, locked: Mapping[str, float]
 ) -> dict[str, Any]:
     """Arguments of ``SerialChain.from_dh``; angles in degrees, lengths in metres.
 
@@ -340,7 +338,7 @@ UR = {  # sections of Universal Robots' file, and the joints that they are of
 }
 
 
-def read_ur_kinematics(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_ur_kinematics(path: AnyPath) -> dict[str, Any]:
     """Arguments of ``from_dh``, of Universal Robots' kinematics file."""
     text = pathlib.Path(path).read_text(encoding="utf-8")
     poses: dict[str, dict[str, float]] = {}

@@ -7,7 +7,6 @@ constants between its joints follow from the table: ``K = C^-1 D C'``, D a row o
 from __future__ import annotations
 
 import functools
-import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -35,7 +34,7 @@ from jaxcal.arms.files.urdf import (
 )
 from jaxcal.arms.sensors.sensor import BASE
 from jaxcal.checks import Array, one_of
-from jaxcal.files import write_over
+from jaxcal.files import AnyPath, write_over
 from jaxcal.models.model import as_parameters
 
 if TYPE_CHECKING:
@@ -68,12 +67,7 @@ class _Part(NamedTuple):
 
 
 def write(
-    arm: Chain,
-    form: str,
-    path: str | os.PathLike[str],
-    parameters: ArrayLike,
-    *,
-    force: bool = False,
+    arm: Chain, form: str, path: AnyPath, parameters: ArrayLike, *, force: bool = False
 ) -> str:
     """Write the arm with ``parameters`` as a file that robots read.
 
@@ -116,7 +110,7 @@ def write(
 def write_chains(
     model: Chains,
     form: str,
-    path: str | os.PathLike[str],
+    path: AnyPath,
     parameters: ArrayLike,
     *,
     force: bool = False,

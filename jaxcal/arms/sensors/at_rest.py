@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from jaxcal.arms.sensors.sensor import Reading, Sensor, Tip, hats
+from jaxcal.arms.sensors.sensor import Located, Reading, Sensor, Tip, hats
 from jaxcal.checks import Array, array_of, in_words, numbers
 from jaxcal.models.model import Quantity
 
@@ -89,9 +89,7 @@ class Gravity(AtRest):
         by_own = np.concatenate([felt[..., None], bias], axis=-1)
         return Reading(parameters[0] * felt + parameters[1:], by_tip, by_own)
 
-    def located(
-        self, tip: Tip, inputs: Array, measured: Array | None
-    ) -> tuple[Self, Array | None]:
+    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
         """Itself. Refused are another unit or up, and a sensor that is turned."""
         if measured is None:
             return self, None
@@ -203,9 +201,7 @@ class Wrench(AtRest):
         values = np.hstack([force, force @ lever.T]) + parameters[4:]
         return Reading(values, by_tip, by_own)
 
-    def located(
-        self, tip: Tip, inputs: Array, measured: Array | None
-    ) -> tuple[Self, Array | None]:
+    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
         """Itself, and how it is turned on the tool where that is far from nominal.
 
         From differences of the forces: zeros do not matter. Refused are torques in

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from jaxcal.arms.sensors.sensor import (
     AXES,
     BASE,
+    Located,
     Pose,
     Reading,
     Sensor,
@@ -224,9 +225,7 @@ class Board(Sensor):
             by_own = np.concatenate([by_own, by_lens.reshape(count, -1, 4)], axis=-1)
         return Reading(values, motion @ by_tip, by_own)
 
-    def located(
-        self, tip: Tip, inputs: Array, measured: Array | None
-    ) -> tuple[Self, Array | None]:
+    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
         """Tool X and place Z of ``A X = Z B`` in closed form (Shah, 2013)."""
         if self.place is not None or (self.corners is not None and measured is None):
             return self, None

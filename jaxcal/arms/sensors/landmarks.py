@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.arms.sensors.sensor import BASE, Reading, Sensor, Tip, hats, label
+from jaxcal.arms.sensors.sensor import BASE, Located, Reading, Sensor, Tip, hats, label
 from jaxcal.checks import Array, array_of, numbers, whole_number
 from jaxcal.models.model import Quantity
 
@@ -131,9 +131,7 @@ class Socket(Landmarks):
         values = tip.position - parameters.reshape(-1, 3)[which]
         return Reading(values, by_tip, self.spread(which, by_one))
 
-    def located(
-        self, tip: Tip, inputs: Array, measured: Array | None
-    ) -> tuple[Self, Array | None]:
+    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
         """Sockets in the middle of the nominal contacts."""
         if self.places is not None:
             return self, None
@@ -225,9 +223,7 @@ class Plane(Landmarks):
         along = unit[:, None] @ across
         return unit, (across - unit[..., None] * along) / size[..., None]
 
-    def located(
-        self, tip: Tip, inputs: Array, measured: Array | None
-    ) -> tuple[Self, Array | None]:
+    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
         """Planes through the nominal points of touch."""
         if self.places is not None:
             return self, None
@@ -317,9 +313,7 @@ class Distance(Landmarks):
         by_one = np.hstack([-unit, -np.ones_like(far)])[:, None]
         return Reading(far - places[:, 3:], by_tip, self.spread(which, by_one))
 
-    def located(
-        self, tip: Tip, inputs: Array, measured: Array | None
-    ) -> tuple[Self, Array | None]:
+    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
         """Anchors nearest to nominal points and lengths, from linear starts.
 
         One is linear in the anchor and its square; of one that is far the lengths are.

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from jaxcal.checks import Array, numbers
-from jaxcal.models.model import Quantity, within_half
+from jaxcal.models.model import Quantity, Rows, within_half
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 BASE = tuple(f"base {axis}" for axis in AXES)
@@ -44,7 +44,7 @@ class Tip:
         """(N, 3, 3) from the tip to the measuring frame."""
         return np.ascontiguousarray(self.frame[:3].transpose(2, 1, 0))
 
-    def at(self, rows: NDArray[np.intp]) -> Tip:
+    def at(self, rows: Rows) -> Tip:
         """At some of the postures."""
         return Tip(self.frame[:, :, rows], lambda: self.nominal()[rows], self.length)
 
@@ -66,7 +66,7 @@ class Readings(NamedTuple):
     tip: Tip  # where it was, of the nominal arm
     columns: Array  # (N, e) of the commands that are its own
     measured: Array | None  # (N, q), None of candidates
-    rows: NDArray[np.intp]  # (N,) of all that the arm measured
+    rows: Rows  # (N,) of all that the arm measured
     scale: Array  # (q,) its unit in that of the arm's readings
     member: int = 0  # its number among the arm's
     kind: str = ""  # of it, for a message
@@ -74,7 +74,7 @@ class Readings(NamedTuple):
     own: Any = slice(0)  # of the arm's parameters
     judged: Any = None  # (D,) distances, of one of several arms alone
 
-    def groups(self) -> list[NDArray[np.intp]]:
+    def groups(self) -> list[Rows]:
         """Rows of each socket, plane or anchor, in the order of measuring."""
         which = self.sensor.of_rows(self.columns)
         return [self.rows[which == i] for i in range(self.sensor.num_places)]
@@ -85,7 +85,7 @@ class Readings(NamedTuple):
         labels = self.sensor.of_rows(self.columns)
         return np.asarray(np.isin(pairs, labels).all(axis=1))
 
-    def at(self, rows: NDArray[np.intp]) -> Readings:
+    def at(self, rows: Rows) -> Readings:
         """Some of them."""
         return self._replace(
             tip=self.tip.at(rows),
@@ -101,6 +101,11 @@ class Reading(NamedTuple):
     values: Array  # (N, q)
     by_tip: Array  # (N, q, 6) by a shift of the tip, and by its turn in radians
     by_own: Array  # (N, q, s) by the sensor's own parameters
+
+
+# A sensor where it stands, and where its tool is seen from the nominal one (4, 4), if
+# that is new.
+Located = tuple["Sensor", Array | None]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -179,9 +184,7 @@ class Sensor(abc.ABC):
         """(..., N, q) differences of readings, those that wrap within half a period."""
         return within_half(off, self.periods)
 
-    def located(
-        self, tip: Tip, inputs: Array, measured: Array | None
-    ) -> tuple[Self, Array | None]:
+    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
         """This sensor where nominal postures (and readings) say that it stands, and
         where its tool is seen from the nominal one (4, 4), if that is new."""
         return self, None
@@ -218,9 +221,7 @@ class Sensor(abc.ABC):
         """This sensor, of others."""
         return members[0]
 
-    def parts(
-        self, inputs: Array
-    ) -> Iterator[tuple[int, Sensor, NDArray[np.intp], Array]]:
+    def parts(self, inputs: Array) -> Iterator[tuple[int, Sensor, Rows, Array]]:
         """Each of them and its number, its rows, and its columns there."""
         yield 0, self, np.arange(len(inputs)), inputs
 

@@ -7,10 +7,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.sensors.sensor import (
     AXES,
+    Located,
     Reading,
     Readings,
     Sensor,
@@ -20,7 +21,7 @@ from jaxcal.arms.sensors.sensor import (
     turns,
 )
 from jaxcal.checks import Array, array_of
-from jaxcal.models.model import Quantity
+from jaxcal.models.model import Quantity, Rows
 from jaxcal.tables import COMMANDS, of_frame
 
 
@@ -127,16 +128,14 @@ class Several(Sensor):
         hidden = [set(one.unseen(arm)) for one in self.sensors]
         return tuple(name for name in arm.names if all(name in h for h in hidden))
 
-    def parts(
-        self, inputs: Array
-    ) -> Iterator[tuple[int, Sensor, NDArray[np.intp], Array]]:
+    def parts(self, inputs: Array) -> Iterator[tuple[int, Sensor, Rows, Array]]:
         which = label("sensor", inputs[:, 0], len(self.sensors))
         for i, one in enumerate(self.sensors):
             rows = np.flatnonzero(which == i)
             at = [self.inputs.index(name) for name in one.inputs]
             yield i, one, rows, inputs[rows][:, at]
 
-    def _tip(self, i: int, tip: Tip, rows: NDArray[np.intp], given: Array) -> Tip:
+    def _tip(self, i: int, tip: Tip, rows: Rows, given: Array) -> Tip:
         """The place of sensor ``i`` at its rows, its mounting as ``given``."""
         tip = tip.at(rows)
         if not self._axes(i):
@@ -189,9 +188,7 @@ class Several(Sensor):
             off[..., rows, :width] = one.wrapped(its, columns, length) / scale
         return off
 
-    def located(
-        self, tip: Tip, inputs: Array, measured: Array | None
-    ) -> tuple[Self, Array | None]:
+    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
         """Each of them, and where those that find it are on the tool."""
         sensors, mounts = [], np.array(self.mounts)
         tool = None

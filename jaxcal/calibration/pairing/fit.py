@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import Array
-from jaxcal.models.model import Model
+from jaxcal.models.model import Model, Rows
 from jaxcal.models.predictions import derivative, predict
 
-Rows = NDArray[np.intp]
+Names = Sequence[str]  # of columns
 Path = tuple[tuple[int, int], ...]  # shifts by rows, and from which row on
 
 AS_IT_IS = "as it is"  # kind of a hypothesis

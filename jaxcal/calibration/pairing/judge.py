@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from jaxcal.calibration.pairing.fit import (
     ColumnChange,
     Fitted,
     Hypothesis,
-    Rows,
+    Names,
     Table,
     as_it_is,
     benign_fits,
@@ -32,7 +31,7 @@ from jaxcal.calibration.pairing.fit import (
 )
 from jaxcal.calibration.reasons import froze, in_rows
 from jaxcal.checks import Array, in_words
-from jaxcal.models.model import Model
+from jaxcal.models.model import Model, Rows
 from jaxcal.models.uncertainty import Prior
 
 if TYPE_CHECKING:
@@ -139,8 +138,8 @@ def of_unfitted(
     commands: Array,
     measured: Array,
     prior: Prior | None,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
+    inputs: Names,
+    outputs: Names,
 ) -> Mispairing | None:
     """How a table was mispaired that could not be fitted, with names of its columns."""
     with contextlib.suppress(ValueError):
@@ -237,7 +236,7 @@ def _table(
 
 
 def _found(
-    table: Table | None, inputs: Sequence[str], outputs: Sequence[str], unit: str
+    table: Table | None, inputs: Names, outputs: Names, unit: str
 ) -> Mispairing | None:
     """The mispairing of a table."""
     if table is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from jaxcal.calibration.pairing.fit import (
     ColumnChange,
     Fitted,
     Hypothesis,
-    Rows,
+    Names,
     Table,
     as_it_is,
     fits_of,
@@ -25,6 +24,7 @@ from jaxcal.calibration.pairing.fit import (
 )
 from jaxcal.calibration.reasons import in_order
 from jaxcal.checks import Array
+from jaxcal.models.model import Rows
 from jaxcal.models.predictions import predict
 
 _RADIAN = 1.7453292519943295e-2  # a degree in radians
@@ -60,7 +60,7 @@ _TURNS = 6  # of assigning readings and fitting
 
 
 def changed_columns(
-    table: Table, plain: Fitted, inputs: Sequence[str], outputs: Sequence[str]
+    table: Table, plain: Fitted, inputs: Names, outputs: Names
 ) -> list[Fitted]:
     """Columns with another sign, unit or place."""
     least = 0.1 if table.model.resolution else 0.02
@@ -82,9 +82,7 @@ def changed_columns(
     ]
 
 
-def by_nominal(
-    table: Table, inputs: Sequence[str], outputs: Sequence[str]
-) -> Fitted | None:
+def by_nominal(table: Table, inputs: Names, outputs: Names) -> Fitted | None:
     """A change by which the prior's mean explains readings that it does not without: a
     nonlinear fit may take up a unit or a sign in a parameter."""
     rows = np.flatnonzero(table.counted)[:_ROWS]
@@ -136,10 +134,7 @@ def _unexplained(
 
 
 def _kinds_of_columns(
-    table: Table,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    theta: Array | None = None,
+    table: Table, inputs: Names, outputs: Names, theta: Array | None = None
 ) -> list[Hypothesis]:
     """Columns with another sign or unit, or in the place of another's; where parameters
     ``theta`` (p,) are expected also in counts."""

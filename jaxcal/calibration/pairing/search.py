@@ -19,7 +19,6 @@ from jaxcal.calibration.pairing.fit import (
     Fitted,
     Hypothesis,
     Path,
-    Rows,
     Table,
     as_it_is,
     log_evidence,
@@ -28,6 +27,7 @@ from jaxcal.calibration.pairing.fit import (
     solved,
 )
 from jaxcal.checks import Array, in_words
+from jaxcal.models.model import Rows
 
 _SHIFTS = (0, 1, -1, 2, -2, 3, -3)
 _EDGES = 128  # rows at which a change is tried first, and of models of many parameters:

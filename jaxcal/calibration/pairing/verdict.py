@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal.calibration.pairing.fit import as_it_is, benign_fits, fitted, predicted
-from jaxcal.calibration.pairing.judge import (
-    LEAST,
-    RATIO,
-    Mispairing,
-    better,
-    of_fit,
-)
+from jaxcal.calibration.pairing.judge import LEAST, RATIO, Mispairing, better, of_fit
 from jaxcal.calibration.reasons import Reason, in_rows
 from jaxcal.calibration.verdict import Verdict, bends
 from jaxcal.checks import in_words
