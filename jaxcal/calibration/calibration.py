@@ -47,8 +47,8 @@ class Calibration(Fit):
     to_dh = late("jaxcal.arms.written:to_dh")
     to_ur_kinematics = late("jaxcal.arms.written:to_ur_kinematics")
     to_lerobot = late("jaxcal.arms.written:to_lerobot")
-    static_transform = late("jaxcal.arms.transforms:static_transform")
-    to_transform = late("jaxcal.arms.transforms:to_transform")
+    static_transform = late("jaxcal.arms.written:static_transform")
+    to_transform = late("jaxcal.arms.written:to_transform")
     to_dict = to_dict
     save = save
 

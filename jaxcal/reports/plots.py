@@ -118,13 +118,6 @@ def legend_right(axes: Any) -> None:
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
-def legend_below(figure: Figure, axes: Any) -> None:
-    """One legend for the whole figure, of the curves of these axes."""
-    handles, labels = axes.get_legend_handles_labels()
-    place = "outside lower center"
-    figure.legend(handles, labels, loc=place, ncols=4, fontsize=8, frameon=False)
-
-
 def plain_log(axis: Any) -> None:
     """1, 2, 5 of each decade, written out."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

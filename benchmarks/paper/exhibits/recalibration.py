@@ -31,7 +31,6 @@ from jaxcal.reports.plots import (
     GREY,
     MARKERS,
     band,
-    legend_below,
     legend_right,
     panels,
 )
@@ -323,5 +322,7 @@ def _traces(columns: Mapping[str, Any], title: str) -> Figure:
     axes[0, 1].set_title("predicted less measured", fontsize=9)
     for each in axes[-1]:
         each.set_xlabel("posture (grey lines: next session)")
-    legend_below(figure, axes[0, 0])
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    place = "outside lower center"
+    figure.legend(handles, labels, loc=place, ncols=4, fontsize=8, frameon=False)
     return figure
