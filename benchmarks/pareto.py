@@ -18,8 +18,7 @@ import numpy as np
 
 from jaxcal.designs.travel import Motion, fastest_tour, travel_times
 from jaxcal.designs.travel.search import ParetoFront
-from jaxcal.reports import plots
-from jaxcal.reports.plots import panels
+from jaxcal.reports.plots import numbered, panels
 from jaxcal.selection import Design, select
 
 MOTION = Motion(speed=(20.0,), acceleration=(100.0,), settle=1.0)
@@ -69,7 +68,16 @@ def main() -> None:
         fronts[f"K = {k}"] = front
     if arguments.figure:
         figure, axes = panels((6.4, 4.0))
-        plots.pareto(axes, fronts)
+        for i, (name, front) in enumerate(fronts.items()):
+            efficiencies = [point.efficiency for point in front.points]
+            seconds = [point.seconds for point in front.points]
+            look = numbered(i) | {"linestyle": "-", "linewidth": 1.0, "markersize": 5}
+            axes.step(efficiencies, seconds, where="pre", label=name, **look)
+        axes.set(
+            xlabel="D-efficiency against the optimum",
+            ylabel="run time (s): travel and settling",
+        )
+        axes.legend(frameon=False)
         figure.savefig(arguments.figure, dpi=150)
         print(f"wrote {arguments.figure}")
 

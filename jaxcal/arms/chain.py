@@ -65,7 +65,6 @@ class SerialChain(Arm, Model):
     error_groups = late("jaxcal.arms.effects:error_groups")
     unexplained = late("jaxcal.arms.effects:unexplained")
     noise_with_play = late("jaxcal.arms.effects:noise_with_play")
-    from_one_side = late("jaxcal.arms.effects:from_one_side")
     verdict = late("jaxcal.arms.verdict:verdict")
     at_rest = late("jaxcal.arms.files.recordings:at_rest")
     recorded = late("jaxcal.arms.files.recordings:recorded")

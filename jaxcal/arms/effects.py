@@ -18,7 +18,7 @@ from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.chain import turning
 from jaxcal.calibration.verdict import left_out
 from jaxcal.checks import Array, numbers
-from jaxcal.models.model import ErrorGroups, Model, as_commands
+from jaxcal.models.model import ErrorGroups, Model
 from jaxcal.models.uncertainty import Noise, Prior
 
 if TYPE_CHECKING:
@@ -228,8 +228,8 @@ def play_in_words(fit: Fit) -> list[str]:
     )
     return [
         f"Residuals depend on the side from which joints came (backlash: {sizes}). "
-        "Approaching always from one side (arm.from_one_side) would reduce the scatter "
-        f"by {1.0 - left:.0%}."
+        "Approaching always from one side would reduce the scatter by "
+        f"{1.0 - left:.0%}."
     ]
 
 
@@ -248,22 +248,6 @@ def noise_with_play(arm: Chain, play: ArrayLike) -> Noise:
     by_inputs = np.zeros(len(arm.sensor.inputs))
     spread = np.concatenate([width / np.sqrt(12.0), by_inputs])
     return dataclasses.replace(arm.default_noise(), command_std=spread)
-
-
-def from_one_side(arm: Chain, commands: ArrayLike, by: float) -> Array:
-    """Joints (N, J) at which to start each move, so that all arrive from below.
-
-    The backlash is then an error of the joint's zero, not of each reading.
-
-    Args:
-        commands: (N, n) postures.
-        by: degrees (or units of length) below, more than the play; less where a
-            joint's limit is nearer.
-    """
-    if not numbers("by", by) > 0.0:
-        raise ValueError(f"by must be positive, got {by:g}")
-    joints = as_commands(arm, commands)[:, : arm.num_joints]
-    return np.maximum(joints - by, np.minimum(arm.limits[:, 0], joints))
 
 
 def unexplained(model: Chain, fit: Fit, rows: Array) -> Array:

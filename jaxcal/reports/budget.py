@@ -33,7 +33,7 @@ class Source:
     Args:
         name: in the budget, such as "laser tracker, certificate 1234".
         offset: () or (m,) standard uncertainty of an offset of every reading, in the
-            measured unit: a zero, say.
+            measured unit: a zero, or U / k of a certificate.
         scale: () or (m,) relative standard uncertainty of the scale of the readings.
         dof: degrees of freedom of these; infinite where they are taken as known.
 
@@ -59,27 +59,6 @@ class Source:
             raise ValueError(f"{self.name} needs an offset or a scale, both are 0")
         if not self.dof > 0.0:
             raise ValueError(f"dof of {self.name} must be positive, got {self.dof}")
-
-    @classmethod
-    def certificate(
-        cls,
-        name: str,
-        expanded: ArrayLike,
-        *,
-        coverage_factor: float = 2.0,
-        dof: float = np.inf,
-    ) -> Source:
-        """An offset from a certificate's expanded uncertainty U and its factor k.
-
-        Args:
-            name: of the instrument.
-            expanded: () or (m,) U, in the measured unit.
-            coverage_factor: k of the certificate; 2 where it states "k = 2".
-            dof: effective degrees of freedom, where the certificate states them.
-        """
-        if not coverage_factor > 0.0:
-            raise ValueError(f"coverage_factor must be positive, got {coverage_factor}")
-        return cls(name, np.asarray(expanded, float) / coverage_factor, dof=dof)
 
 
 @dataclasses.dataclass(frozen=True)

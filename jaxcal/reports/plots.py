@@ -25,11 +25,9 @@ __all__ = [
     "as_bytes",
     "before_after",
     "ellipsoid",
-    "pareto",
     "plan",
     "postures",
     "residuals",
-    "scenarios",
     "selection",
 ]
 
@@ -125,38 +123,6 @@ def plain_log(axis: Any) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
-    """Time against efficiency.
-
-    Args:
-        fronts: ``ParetoFront`` by the name to show.
-    """
-    for i, (name, front) in enumerate(fronts.items()):
-        look = numbered(i) | {"linestyle": "-", "linewidth": 1.0, "markersize": 5}
-        efficiencies = [point.efficiency for point in front.points]
-        seconds = [point.seconds for point in front.points]
-        axes.plot(efficiencies, seconds, drawstyle="steps-pre", label=name, **look)
-    axes.set_ylabel("run time (s): travel and settling")
-    return _finished(axes, "D-efficiency against the optimum")
-
-
-def scenarios(axes: Any, report: Any) -> Any:
-    """Efficiency in each scenario, the worst first, beside that of the nominal's own.
-
-    Args:
-        report: ``Selection.in_scenarios``, of a selection over scenarios.
-    """
-    count = np.arange(1, len(report.weights) + 1)
-    curves = {"this design": report.efficiencies}
-    if report.nominal_efficiencies is not None:
-        curves["made at the nominal"] = report.nominal_efficiencies
-    for i, (name, shares) in enumerate(curves.items()):
-        axes.plot(count, np.sort(shares), label=name, markersize=4, **numbered(i))
-    axes.set(ylabel="efficiency", ylim=(0.0, 1.05))
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return _finished(axes, "scenarios, the worst first")
-
-
 def plan(axes: Any, plan: Any) -> Any:
     """Accuracy against K: the designs, what no design beats, and the target.
 
@@ -174,7 +140,10 @@ def plan(axes: Any, plan: Any) -> Any:
     axes.set_ylabel(f"{plan.summary} standard error of a prediction (measured unit)")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_ylim(bottom=0.0)
-    return _finished(axes, "number of measurements K")
+    axes.set_xlabel("number of measurements K")
+    axes.legend(frameon=False)
+    plain_axes(axes)
+    return axes
 
 
 def before_after(
@@ -229,13 +198,6 @@ def residuals(
     axes.set_ylabel(f"measured - fitted ({unit})" if unit else "measured - fitted")
     if table.shape[1] > 1:
         axes.legend(frameon=False)
-    plain_axes(axes)
-    return axes
-
-
-def _finished(axes: Any, xlabel: str) -> Any:
-    axes.set_xlabel(xlabel)
-    axes.legend(frameon=False)
     plain_axes(axes)
     return axes
 

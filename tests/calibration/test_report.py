@@ -57,7 +57,7 @@ def test_a_pipeline_reads_the_verdict_and_the_exit_code(tmp_path, rng, capsys):
     again = jaxcal.Calibration.load(folder / "calibration.json")
     wanted = jaxcal.Calibration.load(saved)
     assert again.parameters.tolist() == wanted.parameters.tolist()
-    again.report(folder, sources=[Source.certificate("certificate", 0.02)])
+    again.report(folder, sources=[Source("certificate", 0.01)])
     found = json.loads((folder / "verdict.json").read_text())
     assert [s["name"] for s in found["budget"]["sources"]] == ["noise", "certificate"]
     z = np.column_stack([u, np.ones(len(u))])

@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 from questions import pareto_front, score, select_fastest
 
 import jaxcal
 from jaxcal.designs.travel import Motion, fastest_tour, travel_times
 from jaxcal.information.regression import log_det_gram
 from jaxcal.models import Noise, Polynomial, SerialChain
-from jaxcal.reports import plots
 
 MOTION = Motion(speed=(20.0, 10.0, 30.0), acceleration=(50.0, 100.0, 20.0), settle=0.5)
 
@@ -198,14 +196,6 @@ def test_less_efficiency_never_takes_longer(rng):
         for e in (0.5, 0.8, 0.9, 0.95, 1.0)
     ]
     assert seconds == sorted(seconds)
-
-
-def test_the_figure_holds_every_point(rng):
-    front = pareto_front(rng.uniform(-20, 20, (10, 3)), 4, motion=MOTION)
-    axes = plots.pareto(Figure().add_subplot(), {"K = 4": front})
-    assert len(axes.lines[0].get_xdata()) == len(front.points)
-    assert "efficiency" in axes.get_xlabel()
-    assert "(s)" in axes.get_ylabel()
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from jaxcal import Design, I, Mean, Prior, Worst, select
 from jaxcal.models import Affine
 from jaxcal.models.model import Model
-from jaxcal.reports import plots
 from jaxcal.selection.problem import ScenarioProblem
 
 Array = np.ndarray
@@ -201,11 +199,6 @@ def test_a_worst_case_design_pays_at_the_nominal_and_is_worth_it_elsewhere() -> 
     text = str(answer)
     assert "scenarios     3" in text and "nominal's" in text
     assert len(str(report).splitlines()) == 3
-    axes = plots.scenarios(Figure().add_subplot(), report)
-    np.testing.assert_array_equal(
-        axes.lines[0].get_ydata(), np.sort(report.efficiencies)
-    )
-    assert len(axes.lines) == 2
     assert answer.to_dict()["in_scenarios"]["efficiencies"][0] > 0.0
 
 
