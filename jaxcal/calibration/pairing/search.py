@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.pairing.fit import (
-    AS_IT_IS,
     FOREIGN,
     Fitted,
     Hypothesis,
@@ -136,45 +135,35 @@ def ranked(table: Table) -> tuple[float, list[tuple[float, Hypothesis]]]:
     """Evidence of the table as it is, and hypotheses with theirs, the best first."""
     count = len(table.commands)
     systems = _Systems(table)
-    matches, names = _of_all_rows(table, systems.fast)
-    scores = systems.evidence(systems.total(matches))
-    hypotheses = [
-        (float(score) - code, Hypothesis(kind, match, code, starts))
-        for score, match, (kind, code, starts) in zip(
-            scores, matches, names, strict=True
-        )
-    ]
-    base, hypotheses = hypotheses[0][0], hypotheses[1:]
+    alike = _of_all_rows(table, systems.fast)
+    scores = systems.evidence(systems.total(np.array([x.match for x in alike])))
+    scored = zip(scores.tolist(), alike, strict=True)
+    (base, _), *hypotheses = [(score - x.code, x) for score, x in scored]
     if count >= 2 * _LEAST:
         hypotheses += _paths(systems) + _steps(systems)
     return base, sorted(hypotheses, key=lambda pair: -pair[0])
 
 
-def _of_all_rows(
-    table: Table, fast: bool
-) -> tuple[Rows, list[tuple[str, float, Path]]]:
-    """Pairings of all rows alike: (H, N), and kind, code and shift of each."""
+def _of_all_rows(table: Table, fast: bool) -> list[Hypothesis]:
+    """Pairings of all rows alike, the table as it is first."""
     count = len(table.commands)
     rows = np.arange(count)
-    matches = [rows, rows[::-1]]
-    names: list[tuple[str, float, Path]] = [(AS_IT_IS, 0.0, ())]
-    names.append(("reversed", _KINDS, ()))
+    alike = [as_it_is(table), Hypothesis("reversed", rows[::-1], _KINDS)]
     most = min(_LAGS, count // 3) if fast else 3
     for by in itertools.chain(range(1, most + 1), range(-most, 0)):
         if abs(by) < count - _LEAST:
             code = _KINDS + np.log(6.0 if abs(by) <= 3 else 2.0 * count)
-            matches.append(shifted(count, by))
-            names.append(("shift", code, ((0, by),)))
+            alike.append(Hypothesis("shift", shifted(count, by), code, ((0, by),)))
     half = count // 2
     turns = range(1, count) if fast and count <= _EDGES else {half, count - half}
     for by in turns:  # a lag, whose first or last rows are at the other end
         halves = by in (half, count - half)
         near = min(by, count - by) <= 3
         code = _KINDS + np.log(2.0 if halves else 6.0 if near else count)
-        matches.append((rows + by) % count)
         kind = "halves" if halves and not near else "rotation"
-        names.append((kind, code, ((0, by if by < half else by - count),)))
-    return np.array(matches), names
+        path = ((0, by if by < half else by - count),)
+        alike.append(Hypothesis(kind, (rows + by) % count, code, path))
+    return alike
 
 
 def _paths(systems: _Systems) -> list[tuple[float, Hypothesis]]:
