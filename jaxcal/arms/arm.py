@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from jaxcal.arms.chain_kernel import forward
 from jaxcal.arms.sensors import Reading, Sensor, Tip
 from jaxcal.arms.sensors.sensor import BASE, Readings
-from jaxcal.checks import Array, array_of, numbers
+from jaxcal.checks import Array, Indices, Mask, array_of, numbers
 from jaxcal.models.model import as_commands
 
 _T = TypeVar("_T")
@@ -308,7 +308,7 @@ class Arm:
         return self.sensor.read(tip, inputs, self._split(parameters)[2])
 
     def _motion(
-        self, commands: Array, parameters: Array, at: NDArray[np.int64]
+        self, commands: Array, parameters: Array, at: Indices
     ) -> tuple[Array, Array]:
         """Derivative (N, q, S) of the readings by the steps ``at`` (S,), and (N, q, s)
         by the sensor's own parameters."""
@@ -374,7 +374,7 @@ class Arm:
         return shifts, at, (self._steps_of_joints < at[:, None]).sum(axis=1)
 
     @functools.cached_property
-    def _revolute(self) -> NDArray[np.bool_]:
+    def _revolute(self) -> Mask:
         """(n,)."""
         return np.array([kind == "R" for kind in self.joints])
 

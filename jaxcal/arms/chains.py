@@ -30,6 +30,8 @@ from jaxcal.models.model import (
 )
 from jaxcal.models.uncertainty import Noise, Prior
 
+ChainTable = tuple[int, Array, Array | None]  # which, its commands, what it read
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Chains(Model):
@@ -260,7 +262,7 @@ class Chains(Model):
     def _by_member(
         self,
         arms: Sequence[SerialChain],
-        tables: Sequence[tuple[int, Array, Array | None]],
+        tables: Sequence[ChainTable],
     ) -> dict[int, list[Readings]]:
         """What each chain read of a sensor, by its number."""
         by_member: dict[int, list[Readings]] = {}

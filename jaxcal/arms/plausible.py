@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.chain import SerialChain as Chain
-from jaxcal.arms.chains import Chains
+from jaxcal.arms.chains import Chains, ChainTable
 from jaxcal.arms.postures import seen_by
 from jaxcal.arms.sensors import Board, Sensor, Socket, Tip
 from jaxcal.arms.sensors.sensor import Readings
@@ -439,9 +439,7 @@ def prepared_chains(
     return dataclasses.replace(model, chains=tuple(arms))
 
 
-def _located(
-    model: Chains, tables: Sequence[tuple[int, Array, Array | None]]
-) -> list[Chain]:
+def _located(model: Chains, tables: Sequence[ChainTable]) -> list[Chain]:
     """The chains, what they share where the one that reads it most has it."""
     arms, first = list(model.chains), model._firsts
     bases: dict[int, Array] = {}  # by the first chain that stands there

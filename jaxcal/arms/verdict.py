@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from jaxcal.arms.chain import SerialChain as Chain
-from jaxcal.arms.chains import Chains
+from jaxcal.arms.chains import Chains, ChainTable
 from jaxcal.arms.effects import SCATTER, in_words, play_in_words, scatter
 from jaxcal.arms.findings import (
     CLEAR_UP,
@@ -435,7 +435,7 @@ def verdict_of_chains(model: Chains, fit: Any) -> ChainsVerdict:
 
 
 def _shared_parts(
-    model: Chains, used: Rows, tables: list[tuple[int, Array, None]]
+    model: Chains, used: Rows, tables: Sequence[ChainTable]
 ) -> list[Readings]:
     """What chains read of the sensors that they share, of the rows ``used``; distances
     that one chain's contacts judge are left to its own verdict."""

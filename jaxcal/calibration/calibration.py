@@ -8,7 +8,6 @@ import os
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.calibration import file
 from jaxcal.calibration.file import save, to_dict
@@ -16,7 +15,7 @@ from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for
 from jaxcal.calibration.verdict import Verdict, verdict
-from jaxcal.checks import aligned, in_words
+from jaxcal.checks import Mask, aligned, in_words
 from jaxcal.files import AnyPath
 from jaxcal.late import late
 from jaxcal.models.model import Model
@@ -130,9 +129,7 @@ class Calibration(Fit):
         """The arm as calibrated, its parameters nominal, with Position()."""
         return self.whole.calibrated(self.estimate)
 
-    def again(
-        self, model: Any, prior: Prior | None, rows: NDArray[np.bool_] | None = None
-    ) -> Self:
+    def again(self, model: Any, prior: Prior | None, rows: Mask | None = None) -> Self:
         """The calibration by another model of the machine and a prior, None: as of
         ``identify``; of the same readings, or of some ``rows`` (N,) of them."""
         used = self.loss_weights > 0.0

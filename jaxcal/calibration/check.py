@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.pairing import of_new_readings
-from jaxcal.checks import Array, array_of, by_unit, whole_number
+from jaxcal.checks import Array, Indices, Mask, array_of, by_unit, whole_number
 from jaxcal.files import AnyPath
 from jaxcal.information.blocks import without
 from jaxcal.models.model import recorded
@@ -292,9 +292,9 @@ class _Deviations(NamedTuple):
 
     white: Array  # (R,)
     by: Array  # (R, p) their derivatives by the parameters
-    of_level: NDArray[np.bool_]  # (G, R) which of them have one level of noise
-    free: NDArray[np.bool_]  # (p,) parameters that may have drifted and are judged
-    blind: NDArray[np.bool_]  # (p,) those that what was placed anew takes up
+    of_level: Mask  # (G, R) which of them have one level of noise
+    free: Mask  # (p,) parameters that may have drifted and are judged
+    blind: Mask  # (p,) those that what was placed anew takes up
     least: float  # variance, of 1, without the misfit that they allow for
 
 
@@ -327,7 +327,7 @@ def _deviations(
     )
 
 
-def _taken_up(calibration: Fit, placed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _taken_up(calibration: Fit, placed: Mask) -> Mask:
     """(p,) parameters that do nothing but what moving the ``placed`` (p,) ones does."""
     at = calibration.commands, calibration.parameters
     by = np.asarray(calibration.model.jacobian(*at))
@@ -451,7 +451,7 @@ def verification(
     k: int,
     *,
     tolerance: float | Mapping[str, float] | None = None,
-) -> NDArray[np.int64]:
+) -> Indices:
     """(k,) indices of the candidates that best detect a wrong calibration: greedy, then
     swaps, for the mean power of the check that follows.
 

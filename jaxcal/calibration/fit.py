@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.checks import Array, array_of, numbers
+from jaxcal.checks import Array, Mask, array_of, numbers
 from jaxcal.information.singular import depends
 from jaxcal.models.identifiability import Identifiability, identifiability
 from jaxcal.models.model import Model
@@ -303,7 +303,7 @@ class Fit:
         return self.model.with_misfit() if more else self.model
 
     @property
-    def undetermined(self) -> NDArray[np.bool_]:
+    def undetermined(self) -> Mask:
         """(p,) parameters in directions that nothing determines."""
         if self.unidentified is None:
             return np.zeros(len(self.parameters), dtype=np.bool_)

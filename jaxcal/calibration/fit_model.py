@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.calibration.fit_problem import LOSSES, FitProblem, Loss, constants, singular
 from jaxcal.calibration.least_squares import FitSolution, solve
@@ -19,7 +18,7 @@ from jaxcal.calibration.prior_scales import (
     group_scales,
     misfit_scale,
 )
-from jaxcal.checks import Array, one_of, require_kind
+from jaxcal.checks import Array, Mask, one_of, require_kind
 from jaxcal.information.singular import (
     exact_zeros,
     null_directions,
@@ -125,7 +124,7 @@ class _Observations(NamedTuple):
     commands: Array  # (N, n)
     measured: Array  # (N, q)
     weights: Array  # (N,)
-    used: slice | NDArray[np.bool_]  # those of the fit; a slice: all
+    used: slice | Mask  # those of the fit; a slice: all
     command_std: Array  # (N, n)
 
 

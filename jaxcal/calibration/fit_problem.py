@@ -8,7 +8,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import Array
+from jaxcal.checks import Array, Mask
 from jaxcal.information.blocks import gram, triangle
 from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
@@ -77,7 +77,7 @@ class FitProblem:
     reading_std: Array  # (N, q) of a reading of weight 1, at level 1
     mean: Array  # (P,) of the prior
     precision: Array  # (P,) of the prior, 0 where nothing is known
-    free: NDArray[np.bool_]  # (P,) False: held at the mean
+    free: Mask  # (P,) False: held at the mean
     command_std: Array  # (N, n) 0 exact, inf unknown in every measurement
     noise_known: bool  # the level is 1; else it is estimated
     levels: NDArray[np.intp]  # (q,) from 0: outputs of the same number share one

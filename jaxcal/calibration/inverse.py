@@ -5,10 +5,10 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.calibration.fit import Fit, say_far
-from jaxcal.checks import Array, array_of, in_words
+from jaxcal.checks import Array, Mask, array_of, in_words
 from jaxcal.information.singular import (
     depends,
     direction_in_words,
@@ -292,7 +292,7 @@ class _Search(Responses):
             )
         return command
 
-    def newton(self, begin: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def newton(self, begin: Array) -> tuple[Array, Mask]:
         """Damped steps of least length for all points together, and which arrived."""
         commands, rows = begin.copy(), np.arange(len(begin))
         gap = self.gap(commands, rows)
@@ -315,7 +315,7 @@ class _Search(Responses):
             damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-15, 1e9)
         return commands, self._arrived(gap)
 
-    def _arrived(self, gap: Array) -> NDArray[np.bool_]:
+    def _arrived(self, gap: Array) -> Mask:
         tolerance = _REACHED + 1e-14 * np.abs(self.wanted / self.size).max(axis=1)
         return np.asarray(np.abs(gap).max(axis=1) <= tolerance)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaxcal.calibration.fit_problem import FitProblem, constants
 from jaxcal.calibration.least_squares import FitSolution, solve
-from jaxcal.checks import Array
+from jaxcal.checks import Array, Mask
 from jaxcal.models.predictions import derivative
 
 _FEW = 30  # measurements from which on a level of its own costs a reading nothing
@@ -168,7 +168,7 @@ def _best(square: Array, freedom: Array) -> _Levels:
     return best if evidence(best) + _STRONG < evidence(one) else one
 
 
-def _blocks(square: Array, freedom: Array, seen: NDArray[np.bool_]) -> _Levels:
+def _blocks(square: Array, freedom: Array, seen: Mask) -> _Levels:
     """Readings one after another that share a level, halved while that gains."""
     q, price = len(square), 2.0 * np.log(freedom.sum())
     squares = np.append(0.0, np.where(seen, square, 0.0).cumsum())
@@ -198,9 +198,7 @@ def _blocks(square: Array, freedom: Array, seen: NDArray[np.bool_]) -> _Levels:
     return _Levels(says, groups.astype(np.intp), None, 2 * count - 1)
 
 
-def _smooth(
-    square: Array, freedom: Array, seen: NDArray[np.bool_], degree: int
-) -> _Levels | None:
+def _smooth(square: Array, freedom: Array, seen: Mask, degree: int) -> _Levels | None:
     """Levels whose logarithm is a polynomial along the readings, by Chebyshev's."""
     q = len(square)
     basis = np.polynomial.chebyshev.chebvander(np.linspace(-1.0, 1.0, q), degree)

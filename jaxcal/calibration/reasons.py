@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaxcal.checks import Array
+from jaxcal.checks import Array, Mask
 
 if TYPE_CHECKING:
     from jaxcal.calibration.fit import Fit
@@ -170,7 +169,7 @@ def saturated(fit: Fit) -> Reason | None:
     return None
 
 
-def in_order(side: Array, share: float) -> NDArray[np.bool_]:
+def in_order(side: Array, share: float) -> Mask:
     """(columns,) whether one never falls, or never rises, and moves at so many rows."""
     way = np.sign(np.diff(side, axis=0))
     moves = np.abs(way).sum(axis=0) >= share * len(side)

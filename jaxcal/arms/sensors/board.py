@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.sensors.sensor import (
@@ -21,7 +21,7 @@ from jaxcal.arms.sensors.sensor import (
     rotation_vector_rate,
     turns,
 )
-from jaxcal.checks import Array, array_of, numbers, one_of
+from jaxcal.checks import Array, Mask, array_of, numbers, one_of
 from jaxcal.models.model import Quantity
 
 _FEW = 3  # views that find where a board stands and its tool
@@ -122,7 +122,7 @@ class Board(Sensor):
         """(2,) width and height of the camera's picture, where they are known."""
         return np.array(self.camera[:2]) if len(self.camera) == 6 else None
 
-    def in_picture(self, spots: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+    def in_picture(self, spots: Array, margin: float = 0.0) -> Mask:
         """(...) whether pixels (..., 2) without distortion are in the camera's picture,
         or up to ``margin`` pixels outside of it."""
         inside = (spots >= -margin) & (spots <= np.array(self.picture) + margin)

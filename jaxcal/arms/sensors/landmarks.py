@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.arms.sensors.sensor import BASE, Located, Reading, Sensor, Tip, hats, label
-from jaxcal.checks import Array, array_of, numbers, whole_number
+from jaxcal.checks import Array, Indices, array_of, numbers, whole_number
 from jaxcal.models.model import Quantity
 
 
@@ -65,12 +65,12 @@ class Landmarks(Sensor):
     def unseen(self, arm: Any) -> tuple[str, ...]:
         return BASE
 
-    def of_rows(self, inputs: Array) -> NDArray[np.int64]:
+    def of_rows(self, inputs: Array) -> Indices:
         if self.count == 1:
             return np.zeros(len(inputs), dtype=np.int64)
         return label(self.kind, inputs[:, 0], self.count)
 
-    def spread(self, which: NDArray[np.int64], by_one: Array) -> Array:
+    def spread(self, which: Indices, by_one: Array) -> Array:
         """(N, q, s) derivative by all parameters, of (N, q, w) by those of a row's."""
         count, q, w = by_one.shape
         full = np.zeros((count, q, self.count, w))

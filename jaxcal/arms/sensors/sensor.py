@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from jaxcal.checks import Array, numbers
+from jaxcal.checks import Array, Indices, Mask, numbers
 from jaxcal.models.model import Quantity, Rows, within_half
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -79,7 +79,7 @@ class Readings(NamedTuple):
         which = self.sensor.of_rows(self.columns)
         return [self.rows[which == i] for i in range(self.sensor.num_places)]
 
-    def touched(self) -> NDArray[np.bool_]:
+    def touched(self) -> Mask:
         """(D,) distances both of whose sockets have contacts of this arm."""
         pairs = np.array(getattr(self.sensor, "distances", ())).reshape(-1, 4)[:, :2]
         labels = self.sensor.of_rows(self.columns)
@@ -194,7 +194,7 @@ class Sensor(abc.ABC):
         """This sensor, its place found by another arm: what ``located`` has to find."""
         return self
 
-    def of_rows(self, inputs: Array) -> NDArray[np.int64]:
+    def of_rows(self, inputs: Array) -> Indices:
         """(N,) which of the things that stand around each row is of."""
         return np.zeros(len(inputs), dtype=np.int64)
 
@@ -337,7 +337,7 @@ def turns(angles: Array) -> tuple[Array, Array]:
     return whole, axes
 
 
-def label(what: str, column: Array, count: int) -> NDArray[np.int64]:
+def label(what: str, column: Array, count: int) -> Indices:
     """(N,) which of ``count`` things each row is of, checked."""
     whole = column.astype(np.int64)
     bad = np.flatnonzero((whole != column) | (whole < 0) | (whole >= count))

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaxcal.checks import Array
+from jaxcal.checks import Array, Mask
 from jaxcal.models.model import Model, Rows
 from jaxcal.models.predictions import derivative, predict
 
@@ -72,10 +71,10 @@ class Table:
     model: Model
     commands: Array  # (N, n)
     measured: Array  # (N, q)
-    counted: NDArray[np.bool_]  # (N,) False: the reading was left out
+    counted: Mask  # (N,) False: the reading was left out
     mean: Array  # (p,) of the prior
     precision: Array  # (p,) of it
-    free: NDArray[np.bool_]  # (p,)
+    free: Mask  # (p,)
     theta: Array  # (p,) where the model is linearised
     scale: Array  # (q,) in which outputs are compared
     width: Array  # (q,) spread of the readings, in scales
@@ -193,7 +192,7 @@ class Fitted(NamedTuple):
     noise: Array  # (q,) of the readings in scales, outliers left out
     rms: Array  # (q,) in scales of all that are paired, by least squares
     theta: Array  # (p,)
-    inside: NDArray[np.bool_]  # (N,) readings that are paired and no outliers
+    inside: Mask  # (N,) readings that are paired and no outliers
     solution: Array  # (r, c) of the linear system
 
 

@@ -139,25 +139,24 @@ def _kinds_of_columns(
     """Columns with another sign or unit, or in the place of another's; where parameters
     ``theta`` (p,) are expected also in counts."""
     moved = table.commands.shape[1] - table.sensed
-    tables = [(inputs, len(inputs), moved, False)]
-    if not table.model.relative:
-        tables.append((outputs, len(outputs), len(outputs), True))
+    tables = [(inputs, moved, False)]
     # A machine that hardly moves has zero readings everywhere, as contacts.
-    units = _UNITS if table.measured.any() else {}
+    read = table.measured.any()
+    if read and not table.model.relative:
+        tables.append((outputs, len(outputs), True))
+    ways = {"has the other sign": -1.0} | (_UNITS if read else {})
     changes: list[ColumnChange] = []
-    for names, size, count, of_readings in tables:
-        if of_readings and not table.measured.any():
-            continue
+    for names, count, of_readings in tables:
         kinds: list[tuple[str, list[int], float]] = []  # words, columns and factor
         singly = range(count if count <= _MOST else 0)  # no trajectory's readings
         for i in singly:
-            for what, factor in {"has the other sign": -1.0, **units}.items():
+            for what, factor in ways.items():
                 kinds.append((f"{names[i]} {what}", [i], factor))
         side = "the readings" if of_readings else "the commands"
-        together = {"has the other sign": -1.0, **units} if count > 1 else {}
-        if theta is not None and units and moved and not of_readings:
+        together = ways if count > 1 else {}
+        if theta is not None and read and moved and not of_readings:
             most = np.ptp(table.commands[:, :moved], axis=0).max()
-            together |= {
+            together = together | {
                 f"is in counts of {count} a turn, not in {unit}": turn / count
                 for unit, turn in _TURNS_OF.items()
                 for count in _COUNTS
@@ -172,7 +171,7 @@ def _kinds_of_columns(
             if not of_readings:
                 kinds.append((f"{both} have the wrong sign", [i, j], -1.0))
         for words, columns, factor in kinds:
-            order, factors = np.arange(size), np.ones(size)
+            order, factors = np.arange(len(names)), np.ones(len(names))
             factors[columns] = factor
             if factor == 1.0:  # exchanged
                 order[columns] = columns[::-1]

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxcal.calibration.pairing.fit import (
     FOREIGN,
@@ -25,7 +24,7 @@ from jaxcal.calibration.pairing.fit import (
     shifted,
     solved,
 )
-from jaxcal.checks import Array, in_words
+from jaxcal.checks import Array, Mask, in_words
 from jaxcal.models.model import Rows
 
 _SHIFTS = (0, 1, -1, 2, -2, 3, -3)
@@ -71,7 +70,7 @@ class _Systems:
         read = (table.measured / table.scale).reshape(right.shape)
         self.read, self.of_commands = read, right - read
 
-    def of(self, match: Rows) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def of(self, match: Rows) -> tuple[Array, Array, Mask]:
         """Systems of matches (..., N), and which of their rows are paired."""
         paired = (match >= 0) & self.table.counted
         if self.fast:
