@@ -10,23 +10,20 @@ from jaxcal.models import SerialChain, Socket
 from jaxcal.reports import plots
 
 
-def test_an_ellipse_lies_at_its_mahalanobis_distance():
-    axes = Figure().add_subplot()
-    covariance, centre = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([1.0, -2.0])
-    assert plots.ellipsoid(axes, centre, covariance, 3.0) is axes
-    off = axes.lines[0].get_xydata() - centre
-    square = np.einsum("ni,ij,nj->n", off, np.linalg.inv(covariance), off)
-    np.testing.assert_allclose(square, 9.0)
-
-
-def test_an_ellipsoid_lies_at_its_mahalanobis_distance():
-    axes = Figure().add_subplot(projection="3d")
-    covariance = np.diag([4.0, 1.0, 9.0]) + 0.5
-    plots.ellipsoid(axes, np.zeros(3), covariance)
-    points = np.vstack(axes.collections[0]._segments3d)
-    inverse = np.linalg.inv(covariance)
-    square = np.einsum("ni,ij,nj->n", points, inverse, points)
-    np.testing.assert_allclose(square, 1.0)
+def test_an_ellipsoid_lies_at_the_mean_mahalanobis_distance_of_the_chosen(rng):
+    places = rng.random((6, 3))
+    off, every = places - places.mean(axis=0), np.arange(6)
+    for d in (2, 3):
+        axes = Figure().add_subplot(projection="3d" if d == 3 else None)
+        plots.selection(axes, places, every)
+        inverse = np.linalg.inv(np.cov(off[:, :d].T, bias=True))
+        if d == 2:
+            points = axes.lines[-1].get_xydata()
+        else:
+            points = np.vstack(axes.collections[0]._segments3d)
+        points = points - places[:, :d].mean(axis=0)
+        square = np.einsum("ni,ij,nj->n", points, inverse, points)
+        np.testing.assert_allclose(square, d)
 
 
 def test_a_selection_is_drawn_over_its_candidates_and_inside_its_ellipse(rng):

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxcal.checks import Array
 from jaxcal.extras import needs
 
 with needs("plots", "jaxcal.reports.plots"):
@@ -24,7 +25,6 @@ with needs("plots", "jaxcal.reports.plots"):
 __all__ = [
     "as_bytes",
     "before_after",
-    "ellipsoid",
     "plan",
     "postures",
     "residuals",
@@ -202,35 +202,6 @@ def residuals(
     return axes
 
 
-def ellipsoid(
-    axes: Any, centre: ArrayLike, covariance: ArrayLike, scale: float = 1.0, **look: Any
-) -> Any:
-    """Points at Mahalanobis distance ``scale``: an ellipse, or a wire net in 3-D axes.
-
-    Args:
-        axes: matplotlib axes; of projection "3d" for three dimensions.
-        centre: (d,) d = 2 or 3.
-        covariance: (d, d) positive definite.
-        scale: of the distance; ``sqrt(chi2.ppf(0.95, d))`` holds 95 % of a normal.
-        look: passed on to ``plot`` or ``plot_wireframe``.
-    """
-    middle = np.asarray(centre, dtype=np.float64)
-    if middle.shape not in ((2,), (3,)):
-        raise ValueError(f"centre must have 2 or 3 numbers, got shape {middle.shape}")
-    root = scale * np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
-    turn = np.linspace(0.0, 2.0 * np.pi, 200 if len(middle) == 2 else 25)
-    if len(middle) == 2:
-        ring = middle[:, None] + root @ np.stack([np.cos(turn), np.sin(turn)])
-        axes.plot(*ring, **{"color": COLOURS[0]} | look)
-        return axes
-    tilt = np.linspace(0.0, np.pi, 13)[:, None]
-    across = np.sin(tilt) * np.stack([np.cos(turn), np.sin(turn)])[:, None]
-    ball = np.concatenate([across, (np.cos(tilt) * np.ones_like(turn))[None]])
-    net = middle[:, None, None] + np.tensordot(root, ball, axes=1)
-    axes.plot_wireframe(*net, **{"color": COLOURS[0], "linewidth": 0.4} | look)
-    return axes
-
-
 def selection(
     axes: Any,
     candidates: ArrayLike,
@@ -266,10 +237,7 @@ def selection(
     if not axes.lines:  # a second selection is drawn over the same candidates
         axes.plot(*places.T, ".", color=GREY, markersize=3, label="candidates")
     axes.plot(*chosen.T, label=label, **style)
-    scatter = np.atleast_2d(np.cov(chosen.T, bias=True)) if len(chosen) > 1 else None
-    if scatter is not None and np.linalg.matrix_rank(scatter) == count:
-        middle = chosen.mean(axis=0)
-        ellipsoid(axes, middle, scatter, np.sqrt(count), color=style["color"])
+    _ellipsoid(axes, chosen, style["color"])
     if names:
         axes.set(xlabel=names[0], ylabel=names[1])
         if solid:
@@ -277,6 +245,25 @@ def selection(
     if not solid:
         plain_axes(axes)
     return axes
+
+
+def _ellipsoid(axes: Any, chosen: Array, colour: str) -> None:
+    """An ellipse, in 3-D axes a wire net, as far from the mean of points (K, d) as they
+    are by their scatter, in root mean square; nothing of points in a plane."""
+    middle, d = chosen.mean(axis=0), chosen.shape[1]
+    square = d / len(chosen) * (chosen - middle).T @ (chosen - middle)
+    if np.linalg.matrix_rank(square) < d:
+        return
+    root = np.linalg.cholesky(square)
+    turn = np.linspace(0.0, 2.0 * np.pi, 200 if d == 2 else 25)
+    ring = np.stack([np.cos(turn), np.sin(turn)])
+    if d == 2:
+        axes.plot(*(middle[:, None] + root @ ring), color=colour)
+        return
+    tilt = np.linspace(0.0, np.pi, 13)[:, None]
+    ball = [*(np.sin(tilt) * ring[:, None]), np.cos(tilt) * np.ones_like(turn)]
+    net = middle[:, None, None] + np.tensordot(root, ball, axes=1)
+    axes.plot_wireframe(*net, color=colour, linewidth=0.4)
 
 
 def postures(figure: Figure, arm: Any, commands: ArrayLike, columns: int = 4) -> Figure:
