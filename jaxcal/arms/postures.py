@@ -8,20 +8,12 @@ from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.sensors import Board, Plane, Socket
-from jaxcal.checks import (
-    Array,
-    Indices,
-    Mask,
-    array_of,
-    in_words,
-    numbers,
-    whole_number,
-)
+from jaxcal.checks import Array, array_of, in_words, numbers, whole_number
 from jaxcal.models.model import as_commands
 
 _ROUNDS = 40  # batches of starts
@@ -74,7 +66,7 @@ def reachable(arm: Chain, **rules: Any) -> ReachableSet:
     return ReachableSet(arm, **rules)
 
 
-def in_turn(arm: Chain, commands: ArrayLike) -> Indices:
+def in_turn(arm: Chain, commands: ArrayLike) -> NDArray[np.int64]:
     """(N,) the commands' rows in an order of little travel, socket after socket."""
     rows, joints = as_commands(arm, commands), arm.num_joints
     order: list[int] = []
@@ -122,7 +114,7 @@ class ReachableSet:
         near = np.abs(moved[0] - command) <= 1e-6 * np.maximum(np.abs(command), 1.0)
         return bool(there[0] and near.all())
 
-    def onto(self, commands: Array) -> tuple[Array, Mask]:
+    def onto(self, commands: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(N, n) commands moved to where the sensor reads, and (N,) whether it does."""
         commands, j = commands.copy(), self.arm.num_joints
         commands[:, :j] = commands[:, :j].clip(*self.limits.T)
@@ -223,7 +215,7 @@ class ReachableSet:
         kept: int,
         tried: int,
         refused: list[Counter[str]],
-        reached: Mask,
+        reached: NDArray[np.bool_],
     ) -> str:
         """What is missing: a place that no posture reaches, or postures."""
         missed = np.flatnonzero(~reached)
