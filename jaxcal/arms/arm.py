@@ -450,20 +450,19 @@ def _cross(left: Array, right: Array) -> Array:
 
 
 def common(one: Arm, other: Arm) -> int:
-    """Leading joints that two chains have in common."""
+    """Leading joints that two chains have in common, with the links before them."""
     stands = np.allclose(one.base, other.base, atol=_SAME)
     if not stands or one.convention != other.convention:
         return 0
     least = min(len(one.joints), len(other.joints))
-    return next((i for i in range(least) if not _alike(one, other, i)), least)
-
-
-def _alike(one: Arm, other: Arm, i: int) -> bool:
-    """Whether joint ``i`` is the same of both, and the link before it."""
-    names = [
-        [a.joint_names[k] for k in np.flatnonzero(a.drive[i])] for a in (one, other)
-    ]
-    link = i == 0 or np.allclose(one.table[i - 1], other.table[i - 1], atol=_SAME)
-    kind = one.joints[i] == other.joints[i]
-    moves = one.drive[i][one.drive[i] != 0.0], other.drive[i][other.drive[i] != 0.0]
-    return bool(link and kind and names[0] == names[1] and np.array_equal(*moves))
+    for i in range(least):
+        names, moves = [], []
+        for arm in (one, other):
+            moved = np.flatnonzero(arm.drive[i])
+            names.append([arm.joint_names[k] for k in moved])
+            moves.append(arm.drive[i][moved])
+        link = i == 0 or np.allclose(one.table[i - 1], other.table[i - 1], atol=_SAME)
+        alike = names[0] == names[1] and np.array_equal(*moves)
+        if not (link and alike and one.joints[i] == other.joints[i]):
+            return i
+    return least

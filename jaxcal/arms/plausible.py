@@ -47,8 +47,14 @@ def require_readings(arm: Chain, commands: Array, measured: Array | None) -> Non
             if len(part.rows):
                 _require_part(part, commands[part.rows, : arm.num_joints])
     arm.require_commands(commands)
-    if measured is None:
-        _warn_of_radians(arm, commands)
+    turning = np.array(arm.command_units) == "deg"
+    largest = np.abs(commands[:, : arm.num_joints][:, turning]).max(initial=0.0)
+    if measured is None and 0.0 < largest < 2.0 * np.pi:  # all within one turn
+        warnings.warn(
+            f"no joint of any candidate exceeds {largest:.3g} degrees: if these are "
+            "radians, use numpy.degrees",
+            stacklevel=2,
+        )
 
 
 def require_places(arm: Chain, commands: Array, measured: Array | None) -> None:
@@ -253,18 +259,6 @@ def require_touched(sensor: Sensor, inputs: Array) -> None:
         raise ValueError(
             f"commands have no contacts of {sensor.kind} {place}, whose distance from "
             "another is given"
-        )
-
-
-def _warn_of_radians(arm: Chain, candidates: Array) -> None:
-    """Postures of an arm that all lie within one turn, had they been radians."""
-    turning = np.array(arm.command_units) == "deg"
-    largest = np.abs(candidates[:, : arm.num_joints][:, turning]).max(initial=0.0)
-    if 0.0 < largest < 2.0 * np.pi:
-        warnings.warn(
-            f"no joint of any candidate exceeds {largest:.3g} degrees: if these are "
-            "radians, use numpy.degrees",
-            stacklevel=2,
         )
 
 

@@ -60,11 +60,6 @@ class _Part(NamedTuple):
         whole = self.joint.origin @ self.stands
         return np.asarray(whole if self.down else np.linalg.inv(whole))
 
-    def origin_for(self, wanted: Array) -> Array:
-        """The joint's origin that makes ``matrix`` be ``wanted``."""
-        whole = wanted if self.down else np.linalg.inv(wanted)
-        return np.asarray(whole @ np.linalg.inv(self.stands))
-
 
 def write(
     arm: Chain, form: str, path: AnyPath, parameters: ArrayLike, *, force: bool = False
@@ -298,8 +293,9 @@ def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | N
         driving = [k for k, part in enumerate(gap) if part.drives]
         at = driving[-1] if driving else len(gap) - 1
         before, after = _product(gap[:at]), _product(gap[at + 1 :])
-        held = np.linalg.inv(before) @ matrix @ np.linalg.inv(after)
-        origins[gap[at].joint.name] = gap[at].origin_for(held)
+        part, held = gap[at], np.linalg.inv(before) @ matrix @ np.linalg.inv(after)
+        whole = held if part.down else np.linalg.inv(held)
+        origins[part.joint.name] = whole @ np.linalg.inv(part.stands)
     return origins, extra
 
 

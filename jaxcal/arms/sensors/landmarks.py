@@ -216,7 +216,9 @@ class Plane(Landmarks):
         """(N, 3) unit normals of the rows' planes, (N, 3, 2) by both tilts."""
         which = self.of_rows(inputs)
         normals = self._rows()[which, :3]
-        across = np.radians(np.stack(_across(normals), axis=-1))  # (N, 3, 2)
+        first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=-1)])
+        first /= np.linalg.norm(first, axis=-1, keepdims=True)
+        across = np.radians(np.stack([first, np.cross(normals, first)], axis=-1))
         long = normals + (across @ parameters.reshape(-1, 3)[which, :2, None])[..., 0]
         size = np.linalg.norm(long, axis=1, keepdims=True)
         unit = long / size
@@ -271,14 +273,6 @@ class Flush(Plane):
             np.concatenate([height.by_tip, by_tip], axis=1),
             np.concatenate([height.by_own, by_own], axis=1),
         )
-
-
-def _across(normals: Array) -> tuple[Array, Array]:
-    """Two unit vectors (..., 3) across unit vectors and each other."""
-    least = np.eye(3)[np.abs(normals).argmin(axis=-1)]
-    first = np.cross(normals, least)
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
-    return first, np.cross(normals, first)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
