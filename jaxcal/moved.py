@@ -93,4 +93,5 @@ class Finder:
         old, new = module.__spec__.name, module.__spec__.origin  # type: ignore[attr-defined]
         text = f"{old} is {new} since jaxcal 0.3; the old name goes with 0.4"
         warnings.warn(text, DeprecationWarning, stacklevel=2)
-        sys.modules[old] = importlib.import_module(new)
+        sys.modules[old] = here = importlib.import_module(new)
+        vars(here).setdefault("__path__", [])  # of a package that is one module now

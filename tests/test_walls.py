@@ -85,6 +85,7 @@ def test_import_costs_numpy_alone(tmp_path):
         ("jaxcal.models.serial.urdf", "jaxcal.arms.files.urdf"),
         ("jaxcal.models.sensors", "jaxcal.arms.sensors"),
         ("jaxcal.pages", "jaxcal.reports.page"),
+        ("jaxcal.plots.curves", "jaxcal.reports.plots"),
         ("jaxcal.calibration.budget", "jaxcal.reports.budget"),
         ("rig.simulator", "rig_workbench.simulator"),
         ("rig.simulator.truth", "rig_workbench.simulator.truth"),
