@@ -722,7 +722,7 @@ def _expected(
     model, theta = found.model, found.parameters
     free = found.free[: len(theta)] > 0.0
     blocks = model.jacobian(table, theta)[..., free] / np.mean(found.noise_std)
-    known = model.facts(theta)[1][:, free]
+    known = model.fitting.facts(theta)[1][:, free]
     prior = np.diag(found.prior_precision[: len(theta)][free]) + known.T @ known
     judged = []
     for joints, sockets in others:

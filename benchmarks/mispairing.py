@@ -159,7 +159,7 @@ def _split(case: Case) -> tuple[Array, Array, Callable[[Array], tuple[Array, Arr
 
 def _sensed(case: Case) -> slice | None:
     model = case.options.get("model")
-    sensed = slice(0, 0) if model is None else model.sensed
+    sensed = slice(0, 0) if model is None else model.fitting.sensed
     return sensed if sensed.stop > sensed.start else None
 
 
@@ -313,7 +313,9 @@ COLUMNS = {
 def _moved(case: Case) -> int:
     model = case.options.get("model")
     width = case.commands.shape[1]
-    return width if model is None else width - len(np.arange(width)[model.sensed])
+    return (
+        width if model is None else width - len(np.arange(width)[model.fitting.sensed])
+    )
 
 
 def _name(case: Case, i: int) -> str:

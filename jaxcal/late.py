@@ -11,11 +11,12 @@ from typing import Any
 class late:
     """A method that a module further up defines: ``report = late("module:function")``.
 
-    Asked for, of the class or of an object, it is that function.
+    Asked for, of the class or of an object, it is that function; with ``of`` that of
+    the object's attribute of this name.
     """
 
-    def __init__(self, path: str) -> None:
-        self.path = path
+    def __init__(self, path: str, of: str = "") -> None:
+        self.path, self.of = path, of
 
     @functools.cached_property
     def function(self) -> Callable[..., Any]:
@@ -25,5 +26,7 @@ class late:
         return function
 
     def __get__(self, instance: Any, owner: type | None = None) -> Callable[..., Any]:
+        if self.of and instance is not None:
+            instance = getattr(instance, self.of)
         method: Callable[..., Any] = self.function.__get__(instance, owner)
         return method

@@ -54,7 +54,8 @@ class DeviceModel:
 
     def attitude_with(self, parameters: Array) -> Callable[[Array], Array]:
         """Command (n,) to attitude (3, 3) of the tip of an arm with parameters (p,)."""
-        arm: Any = self.model.calibrated(parameters)
+        model: Any = self.model
+        arm = model.calibrated(parameters)
         return lambda command: arm.rotations(command[None], np.zeros((1, 3)))[0]
 
     def axes_at(self, command: Array) -> Array:
@@ -78,12 +79,13 @@ class DeviceModel:
     def identify(self, config: RigConfig, records: list[Record]) -> Any:
         """The parameters from chosen postures: a ``jaxcal.Calibration``."""
         limit = config.session.verify_limit_deg
+        judged = self.model.fitting.accuracy_units(config.output_unit)
         return fit_quietly(
             config,
             *self.outputs(config, records),
             model=self.model,
             prior=self.prior,
-            accuracy=limit if self.model.accuracy_units(config.output_unit) else None,
+            accuracy=limit if judged else None,
         )
 
     def held_out_errors(

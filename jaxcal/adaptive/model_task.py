@@ -121,7 +121,7 @@ def candidates_of(
     commands = as_commands(model, candidates)
     if not len(commands):
         raise ValueError("candidates must hold at least one row")
-    model = model.prepared(commands)
+    model = model.fitting.prepared(commands)
     mean, std, draw = _drawn(model, prior)
     at_mean = predict(model, commands, mean)
     white = _whitening(model, noise, commands, mean, at_mean.shape)

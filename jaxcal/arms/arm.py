@@ -323,30 +323,6 @@ class Arm:
         by_steps = np.ascontiguousarray(motion.transpose(2, 1, 0))
         return reading.by_tip @ by_steps, reading.by_own
 
-    def log_size(self, commands: Array, parameters: Array) -> Array | None:
-        """Logarithm of how far the joints move the tip (N,).
-
-        Of contacts of turning joints, which touch as well with an arm of any size: the
-        root of the sum of squares, of all postures, of how far the tip is from each
-        axis. By turns it is held. The way of a slide that moves shows the size: None.
-        """
-        if not self._grows(commands):
-            return None
-        _, square = self._levers(commands, parameters)
-        return 0.5 * np.log(square)
-
-    def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
-        if not self._grows(commands):
-            return np.zeros((len(commands), len(parameters)))
-        levers, square = self._levers(commands, parameters)
-        axes = self._chain(commands, parameters)[1]
-        # A shift moves the tip away from the axes before it.
-        shifts, at, joints = self._shifts
-        before = np.concatenate([np.zeros((1, *levers[0].shape)), levers.cumsum(0)])
-        slopes = np.zeros(len(parameters))
-        slopes[shifts] = np.einsum("skn,skn->s", before[joints], axes[at]) / square[0]
-        return np.broadcast_to(slopes, (len(commands), len(slopes)))
-
     @_kept
     def _levers(self, commands: Array, parameters: Array) -> tuple[Array, Array]:
         """(n, 3, N) from the axis of each joint to the tip, (N,) all their squares."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -23,13 +23,14 @@ from jaxcal.arms.arguments import (
 )
 from jaxcal.arms.arm import Arm, Load, apparent_length, numbered
 from jaxcal.arms.files.urdf import joints_of, read_ur_kinematics, read_urdf
+from jaxcal.arms.fitting import ArmFitting
 from jaxcal.arms.sensors import Position, Sensor, Several
 from jaxcal.arms.sensors.sensor import plain_fields
 from jaxcal.arms.sensors.several import OneTable, stacked
 from jaxcal.checks import Array, array_of, axis_names, numbers, one_of
 from jaxcal.files import AnyPath
 from jaxcal.late import late
-from jaxcal.models.model import Model, Quantity, Rows, Theta, as_commands, as_parameters
+from jaxcal.models.model import Model, Quantity, Theta, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise
 
 
@@ -53,24 +54,21 @@ class SerialChain(Arm, Model):
 
     # Of modules that know this one.
     located = late("jaxcal.arms.plausible:located")
-    anew = late("jaxcal.arms.plausible:anew")
-    prepared = late("jaxcal.arms.plausible:prepared")
-    require_commands = late("jaxcal.arms.plausible:require_commands")
     postures = late("jaxcal.arms.postures:postures")
     reachable = late("jaxcal.arms.postures:reachable")
     in_turn = late("jaxcal.arms.postures:in_turn")
-    improved = late("jaxcal.arms.effects:improved")
     default_prior = late("jaxcal.arms.effects:default_prior")
     parameter_sizes = late("jaxcal.arms.effects:parameter_sizes")
-    error_groups = late("jaxcal.arms.effects:error_groups")
-    unexplained = late("jaxcal.arms.effects:unexplained")
     noise_with_play = late("jaxcal.arms.effects:noise_with_play")
-    verdict = late("jaxcal.arms.verdict:verdict")
     at_rest = late("jaxcal.arms.files.recordings:at_rest")
     recorded = late("jaxcal.arms.files.recordings:recorded")
     write = late("jaxcal.arms.files.write:write")
     standing_as = late("jaxcal.arms.files.write:standing_as")
     write_servos = late("jaxcal.arms.files.recordings:write_servos")
+
+    @functools.cached_property
+    def fitting(self) -> ArmFitting:
+        return ArmFitting(self)
 
     @classmethod
     def from_dh(
@@ -264,27 +262,6 @@ class SerialChain(Arm, Model):
             return self
         return self.with_effects(harmonics=turning(self.joints))
 
-    @property
-    def misfit_std(self) -> float:
-        """What harmonics leave of the misfit, which a choice counts as noise."""
-        return self.sensor.misfit * self.length
-
-    @property
-    def fits_misfit(self) -> bool:
-        return not self.sensor.local
-
-    @property
-    def sensed(self) -> slice:
-        return slice(self.num_joints, self.num_inputs)
-
-    def distinct(self, commands: Array, measured: Array) -> Rows:
-        kept = [np.zeros(0, dtype=np.intp)]
-        for _, one, rows, _ in self.sensor.parts(commands[:, self.num_joints :]):
-            if one.zeros and not measured[rows].any():
-                rows = rows[np.unique(commands[rows], axis=0, return_index=True)[1]]
-            kept.append(rows)
-        return np.sort(np.concatenate(kept))
-
     def calibrated(self, parameters: ArrayLike, sensor: Sensor | None = None) -> Self:
         """The arm whose nominal is this one with ``parameters`` (p,), with a
         ``sensor``, else Position()."""
@@ -371,12 +348,6 @@ class SerialChain(Arm, Model):
         others = ("deg", "rad", "m/s", "g", "N", "p", "times")
         return of_file if measured_unit.startswith(others) else measured_unit or of_file
 
-    def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
-        of_each = [self.quantities_of(s, measured_unit) for s in self.sensor.members]
-        return tuple(
-            dict.fromkeys(q.unit for quantities in of_each for q in quantities)
-        )
-
     def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         return self._reading(commands, theta).values.copy()
@@ -412,51 +383,8 @@ class SerialChain(Arm, Model):
         by_inputs = np.zeros((*result.shape[:2], len(self.sensor.inputs)))
         return np.concatenate([result @ self.drive, by_inputs], axis=-1)
 
-    def wrapped(self, off: Array, commands: Array) -> Array:
-        return self.sensor.wrapped(off, commands[:, self.num_joints :], self.length)
-
-    def facts(self, parameters: Theta = None) -> tuple[Array, Array]:
-        theta, at = as_parameters(self, parameters), self._at["sensor"]
-        off, rows = self.sensor.facts(theta[at])
-        slopes = np.zeros((len(off), len(theta)))
-        slopes[:, at] = rows
-        return off, slopes
-
     def default_noise(self) -> Noise:
         return Noise(std=self.sensor.stds(self.length or 1.0))
-
-    @property
-    def placed(self) -> tuple[str, ...]:
-        return self.sensor.names
-
-    @property
-    def slips(self) -> tuple[str, ...]:
-        """The joints' zeros."""
-        zeros = enumerate(self.joints, 1)
-        return tuple(f"{'theta' if kind == 'R' else 'd'}{i}" for i, kind in zeros)
-
-    @property
-    def relative(self) -> bool:
-        return self.sensor.relative
-
-    def targets(
-        self, desired: Array, start: Array | None
-    ) -> Callable[[Array, Rows], Array]:
-        """What to reach; of a pose its turns from the nominal orientation there."""
-        if not self.relative:
-            return super().targets(desired, start)
-        if start is None:
-            raise ValueError(
-                "start is missing: for an arm's pose give joints, at whose nominal "
-                "orientation desired is a turn, as in rotation_vectors(start, R)"
-            )
-        turned = self.rotations(start, desired[:, 3:])
-
-        def goal(commands: Array, rows: Rows) -> Array:
-            turns = self.rotation_vectors(commands, turned[rows])
-            return np.hstack([desired[rows, :3], turns])
-
-        return goal
 
     def to_dict(self) -> dict[str, Any]:
         """What a file holds of the model."""

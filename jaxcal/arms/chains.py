@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxcal.arms.arm import COLUMNS, WAVES, common
 from jaxcal.arms.chain import SerialChain
+from jaxcal.arms.fitting import ChainsFitting
 from jaxcal.arms.sensors import Sensor
 from jaxcal.arms.sensors.sensor import BASE, Readings, label
 from jaxcal.arms.sensors.several import OneTable, stacked
@@ -21,7 +22,6 @@ from jaxcal.checks import Array, one_of
 from jaxcal.files import AnyPath
 from jaxcal.late import late
 from jaxcal.models.model import (
-    ErrorGroups,
     Model,
     Rows,
     Theta,
@@ -55,14 +55,16 @@ class Chains(Model):
     """
 
     # Of modules that know this one.
-    prepared = late("jaxcal.arms.plausible:prepared_chains")
-    verdict = late("jaxcal.arms.verdict:verdict_of_chains")
     of_chain = late("jaxcal.arms.verdict:of_chain")
     write = late("jaxcal.arms.files.write:write_chains")
 
     tips: tuple[str, ...]
     chains: tuple[SerialChain, ...]
     stands: tuple[tuple[int, ...], ...]
+
+    @functools.cached_property
+    def fitting(self) -> ChainsFitting:
+        return ChainsFitting(self)
 
     @classmethod
     def of(cls, chains: Mapping[str, SerialChain]) -> Self:
@@ -316,18 +318,6 @@ class Chains(Model):
         place, q = len(self.joint_names), self.num_outputs
         return stacked(named, place, self.inputs, self.num_inputs, q)
 
-    def require_commands(self, commands: Array) -> None:
-        for k, arm, _, arm_commands in self._parts(commands):
-            with self._naming(k):
-                arm.require_commands(arm_commands)
-
-    def distinct(self, commands: Array, measured: Array) -> Rows:
-        counting = [
-            rows[arm.distinct(arm_commands, measured[rows])]
-            for _, arm, rows, arm_commands in self._parts(commands)
-        ]
-        return np.sort(np.concatenate(counting))
-
     @property
     def nominal(self) -> Array:
         """(p,)."""
@@ -370,46 +360,6 @@ class Chains(Model):
         """The unit of lengths, which all arms share; see ``SerialChain``."""
         return self.chains[0].length_unit(measured_unit)
 
-    def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
-        units = (unit for arm in self.chains for unit in arm.accuracy_units(""))
-        return tuple(dict.fromkeys(units))
-
-    def wrapped(self, off: Array, commands: Array) -> Array:
-        off = off.copy()
-        for k, arm, rows, arm_commands in self._parts(commands):
-            scale, q = self._scale(k), arm.num_outputs
-            its = off[..., rows, :q] * scale
-            off[..., rows, :q] = arm.wrapped(its, arm_commands) / scale
-        return off
-
-    def log_size(self, commands: Array, parameters: Array) -> Array | None:
-        sizes, grow = np.zeros(len(commands)), False
-        for k, arm, rows, arm_commands in self._parts(commands):
-            size = arm.log_size(arm_commands, parameters[self.members[k]])
-            if size is not None:
-                sizes[rows], grow = size, True
-        return sizes if grow else None
-
-    def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
-        slopes = np.zeros((len(commands), len(parameters)))
-        for k, arm, rows, arm_commands in self._parts(commands):
-            at = self.members[k]
-            of_arm = arm.log_size_jacobian(arm_commands, parameters[at])
-            slopes[np.ix_(rows, at)] = of_arm
-        return slopes
-
-    def facts(self, parameters: Theta = None) -> tuple[Array, Array]:
-        theta = as_parameters(self, parameters)
-        offs, rows = [np.zeros(0)], [np.zeros((0, len(theta)))]
-        for (k, i), *_ in self._members:  # a distance is known once
-            arm = self.chains[k]
-            columns = self.members[k][arm.own(i)]
-            off, slopes = arm.sensor.members[i].facts(theta[columns])
-            offs.append(off)
-            rows.append(np.zeros((len(off), len(theta))))
-            rows[-1][:, columns] = slopes
-        return np.concatenate(offs), np.concatenate(rows)
-
     def default_noise(self) -> Noise:
         return Noise(std=1.0)
 
@@ -436,42 +386,12 @@ class Chains(Model):
         sizes = [arm.parameter_sizes() for arm in self.chains]
         return np.asarray(self._gather(sizes))
 
-    def error_groups(self) -> ErrorGroups:
-        """Groups as of ``SerialChain`` of each chain, of harmonics one for all, last;
-        what chains share is in the first one's."""
-        groups = [arm.error_groups() for arm in self.chains]
-        count, members = len(groups[0].medians) - 1, []
-        for k, (of_arm, _, _) in enumerate(groups):
-            numbered = np.where(of_arm < 0, -1, of_arm + count * k)
-            members.append(np.where(of_arm == count, count * len(groups), numbered))
-        medians, spreads = (
-            np.append(np.tile(one[:-1], len(groups)), one[-1]) for one in groups[0][1:]
-        )
-        return ErrorGroups(self._gather(members), medians, spreads)
-
-    @property
-    def misfit_std(self) -> float:
-        arms = enumerate(self.chains)
-        return max(arm.misfit_std / float(self._scale(k).min()) for k, arm in arms)
-
-    @property
-    def fits_misfit(self) -> bool:
-        return all(arm.fits_misfit for arm in self.chains)
-
     def with_misfit(self) -> Self:
         return self._bent
 
     @functools.cached_property
     def _bent(self) -> Self:  # kept, and what it keeps with it
         return self._each(SerialChain.with_misfit)
-
-    @property
-    def placed(self) -> tuple[str, ...]:
-        return self._of_arms(lambda arm: arm.placed)
-
-    @property
-    def slips(self) -> tuple[str, ...]:
-        return self._of_arms(lambda arm: arm.slips)
 
     def calibrated(self, parameters: ArrayLike) -> Self:
         """The chains whose nominal is this one with ``parameters``."""

@@ -108,7 +108,7 @@ def improved(model: Chain, fit: Fit) -> Fit:
     """
     stated = fit.noise_std is None or fit.noise_known or "prior" in fit.provenance
     few = fit.num_measurements < max(_ENOUGH, len(model.joint_names) + 6)
-    if stated or few or not model.fits_misfit or scatter(fit) < SCATTER:
+    if stated or few or not model.fitting.fits_misfit or scatter(fit) < SCATTER:
         return fit
     if fit.mispairing is not None:  # no effect of the arm
         return fit

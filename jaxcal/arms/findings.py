@@ -248,7 +248,7 @@ def other_distances(
         if not len(distances):
             continue
         off, rows = _facts(fit, part)
-        _, facts = fit.model.facts(fit.parameters)
+        _, facts = fit.model.fitting.facts(fit.parameters)
         spread = rows @ _at_these_sizes(fit, facts)
         share = np.minimum((spread * rows).sum(axis=1), 1.0 - 1e-9)
         change = np.array(distances)[:, 3] * np.abs(off) / (1.0 - share)

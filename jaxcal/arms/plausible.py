@@ -46,7 +46,7 @@ def require_readings(arm: Chain, commands: Array, measured: Array | None) -> Non
         for part in arm.readings(commands, measured):
             if len(part.rows):
                 _require_part(part, commands[part.rows, : arm.num_joints])
-    arm.require_commands(commands)
+    arm.fitting.require_commands(commands)
     turning = np.array(arm.command_units) == "deg"
     largest = np.abs(commands[:, : arm.num_joints][:, turning]).max(initial=0.0)
     if measured is None and 0.0 < largest < 2.0 * np.pi:  # all within one turn

@@ -282,7 +282,7 @@ def _nominal(fit: Fit, used: Rows, parts: list[Readings]) -> Array:
     commands, measured = fit.commands[used], fit.measured[used]
     model, off = fit.model, np.zeros_like(fit.residuals)
     predicted = model.located(commands, measured).predict(commands)
-    off[used] = model.wrapped(measured - predicted, commands)
+    off[used] = model.fitting.wrapped(measured - predicted, commands)
     for part in parts:  # a socket's place is no merit of either
         for rows in part.groups():
             off[rows] -= off[rows].mean(axis=0) if len(rows) else 0.0

@@ -18,7 +18,7 @@ from jaxcal.calibration.verdict import Verdict, verdict
 from jaxcal.checks import Mask, aligned, in_words
 from jaxcal.files import AnyPath
 from jaxcal.late import late
-from jaxcal.models.model import Model
+from jaxcal.models.model import Model, of_arm
 from jaxcal.models.uncertainty import Noise, Prior
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class Calibration(Fit):
         with cross-validated errors."""
         from jaxcal.calibration.pairing import against
 
-        own = self.model.verdict(self) or verdict(self)
+        own = self.model.fitting.verdict(self) or verdict(self)
         return against(own, self, self.mispairing)
 
     @functools.cached_property
@@ -127,7 +127,7 @@ class Calibration(Fit):
     @property
     def arm(self) -> Any:
         """The arm as calibrated, its parameters nominal, with Position()."""
-        return self.whole.calibrated(self.estimate)
+        return of_arm(self.whole, "calibrated")(self.estimate)
 
     def again(self, model: Any, prior: Prior | None, rows: Mask | None = None) -> Self:
         """The calibration by another model of the machine and a prior, None: as of

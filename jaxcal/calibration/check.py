@@ -134,12 +134,16 @@ def check(
     all_commands, measured, _ = recorded(calibration.model, commands, measured)
     say_order(all_commands, measured)
     every = _checked(calibration, all_commands, measured)
-    rows = calibration.model.distinct(*every)
+    rows = calibration.model.fitting.distinct(*every)
     commands, measured = (side[rows] for side in every)
     off = _deviations(calibration, commands, measured, placed_anew)
     names, free = calibration.names, off.free
     signal = (off.of_level @ off.by**2).T
-    slips = free & np.isin(names, calibration.model.slips) & (signal.sum(axis=1) > 0.0)
+    slips = (
+        free
+        & np.isin(names, calibration.model.fitting.slips)
+        & (signal.sum(axis=1) > 0.0)
+    )
     tests = ChangeTests(
         off.of_level.sum(axis=1), calibration, int(slips.sum()), off.least
     )
@@ -304,7 +308,7 @@ def _deviations(
     """The deviations of measurements, of which ``check`` has the arguments."""
     noise = calibration.require_noise("check")
     predicted = calibration.outputs_at(commands)
-    off = calibration.model.wrapped(measured - predicted, commands)
+    off = calibration.model.fitting.wrapped(measured - predicted, commands)
     _require_unit(calibration, predicted + off, predicted, noise)
     slopes = np.asarray(calibration.model.jacobian(commands, calibration.parameters))
     p, names = slopes.shape[-1], calibration.names
@@ -313,9 +317,11 @@ def _deviations(
     level = np.tile(_levels(calibration), len(commands))  # of each reading
     free, blind = calibration.free[:p] > 0.0, np.zeros(p, dtype=np.bool_)
     if placed_anew:
-        if not calibration.model.placed:
+        if not calibration.model.fitting.placed:
             raise ValueError("placed_anew needs sockets, planes, wires or a board")
-        placed = np.isin(names, calibration.model.placed)  # which says nothing now
+        placed = np.isin(
+            names, calibration.model.fitting.placed
+        )  # which says nothing now
         white, by = without(by[:, placed], white, by)
         level, free = np.zeros(len(white), dtype=np.intp), free & ~placed
         blind = free & _taken_up(calibration, placed)
@@ -399,7 +405,7 @@ def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:
     rows = array_of(name, given, "N", calibration.num_inputs)
     if not len(rows):
         raise ValueError(f"{name} must hold at least one row, got none")
-    calibration.model.require_commands(rows)
+    calibration.model.fitting.require_commands(rows)
     return rows
 
 
@@ -478,7 +484,7 @@ def verification(
     judged = (calibration.free[: len(change)] > 0.0) & np.isfinite(change)
     shifts = signal[:, judged] * change[judged, None] ** 2  # of one posture
     counts = of_level.sum(axis=1)
-    slips = np.isin(calibration.names, calibration.model.slips)[judged]
+    slips = np.isin(calibration.names, calibration.model.fitting.slips)[judged]
 
     chosen: list[int] = []
     for turn in range(1 + _SWEEPS):

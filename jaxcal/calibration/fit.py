@@ -260,7 +260,7 @@ class Fit:
         variance = above_rounding(
             ((slopes @ covariance) * slopes).sum(axis=-1), slopes, covariance
         )
-        more = self.model.unexplained(self, rows) ** 2
+        more = self.model.fitting.unexplained(self, rows) ** 2
         variance = variance + np.maximum(more, of_readings) + self.session_std**2
         if self.unidentified is not None:
             variance = np.where(depends(slopes, self.unseen), np.inf, variance)

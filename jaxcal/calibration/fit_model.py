@@ -82,12 +82,12 @@ def fit_model(
     used = slice(None) if weights.all() else weights > 0.0
     spread = command_noise(noise, commands, measured.shape[1])
     exact = not spread.any()
-    model = model.prepared(commands[used], measured[used])
-    if not exact and model.error_groups() is not None:
+    model = model.fitting.prepared(commands[used], measured[used])
+    if not exact and model.fitting.error_groups() is not None:
         noise, exact = with_play(model, noise, commands, spread), True
         spread = np.zeros_like(spread)
     with_misfit = model.with_misfit() if prior is None and exact else model
-    fitted = with_misfit if model.fits_misfit else model
+    fitted = with_misfit if model.fitting.fits_misfit else model
     scaled = prior is not None or exact  # as far as the prior wants it
     stated = prior is not None and not prior.by_data
     prior = prior or fitted.default_prior()
@@ -97,7 +97,7 @@ def fit_model(
     )
     scales, misfit_factor, shared = None, 1.0, ""
     if prior.by_data and scaled:
-        if fitted.error_groups() is None or not exact:
+        if fitted.fitting.error_groups() is None or not exact:
             raise ValueError("Prior.sized() needs an arm, without command_std")
         solution, scales, misfit_factor = _solve_with_misfit(problem, with_misfit)
     elif common_noise is None and are_shared(problem):
@@ -166,7 +166,7 @@ def _problem(
         noise_known=noise.std is not None or noise.covariance is not None,
         levels=levels,
         loss=loss,
-        first_log_size=model.log_size(counted, mean),
+        first_log_size=model.fitting.log_size(counted, mean),
     )
     return problem, centre
 
@@ -178,7 +178,7 @@ def _distinct_weights(
     used = slice(None) if weights.all() else weights > 0.0
     if not weights.any():
         raise ValueError("weights must be positive for at least one measurement")
-    once = model.distinct(commands[used], measured[used])
+    once = model.fitting.distinct(commands[used], measured[used])
     if len(once) == len(weights):
         return weights
     rows, distinct = np.flatnonzero(weights)[once], np.zeros_like(weights)
@@ -309,7 +309,7 @@ def _fields(
         off = off - problem.model.predict(others, solution.parameters)
         residuals = np.empty_like(observations.measured)
         residuals[used] = solution.residuals
-        residuals[~used] = problem.model.wrapped(off, others)
+        residuals[~used] = problem.model.fitting.wrapped(off, others)
     loss_weights, distance = np.zeros((2, len(commands)))
     loss_weights[used], distance[used] = solution.weights, solution.deleted
     return {
@@ -358,13 +358,15 @@ def _covariance(solution: FitSolution) -> tuple[Array, Array | None]:
         return covariance, None
     root_shares = np.sqrt(_information_shares(solution))
     rows = (root_shares[:, None, None] * solution.rows).reshape(-1, len(free))
-    rows = np.concatenate([rows, problem.model.facts(solution.parameters)[1][:, free]])
+    rows = np.concatenate(
+        [rows, problem.model.fitting.facts(solution.parameters)[1][:, free]]
+    )
     precision = problem.precision[free]
     scale = np.sqrt((rows**2).sum(axis=0) + precision)
     scale = np.where(scale > 0.0, scale, 1.0)
     whole = np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale
     root, null = [np.zeros((0, len(free)))], [np.zeros((0, len(free)))]
-    off = problem.model.resolution
+    off = problem.model.fitting.resolution
     of_rows = 0  # combinations of the parameters that the readings use up
     for columns, of_columns, right in singular(whole):
         determined = significant(of_columns, off=off)

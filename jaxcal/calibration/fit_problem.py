@@ -87,7 +87,7 @@ class FitProblem:
     def growth(self, theta: Array) -> Array | None:
         """(N, 1) by which contacts' readings are larger than at the prior's mean, up to
         ``_LARGER``, or a tool would grow without end; None: by nothing."""
-        log = self.model.log_size(self.commands, theta)
+        log = self.model.fitting.log_size(self.commands, theta)
         if log is None or self.first_log_size is None:
             return None
         larger = np.minimum(log - self.first_log_size, _LARGER)
@@ -95,8 +95,8 @@ class FitProblem:
 
     def growth_slopes(self, theta: Array) -> Array:
         """(N, F) derivative of the logarithm of ``growth``."""
-        slopes = self.model.log_size_jacobian(self.commands, theta)
-        log = self.model.log_size(self.commands, theta)
+        slopes = self.model.fitting.log_size_jacobian(self.commands, theta)
+        log = self.model.fitting.log_size(self.commands, theta)
         if log is not None and self.first_log_size is not None:
             slopes = slopes * (log - self.first_log_size < _LARGER)[:, None]
         return self._zeros * (slopes if self.free.all() else slopes[:, self.free])
@@ -123,7 +123,7 @@ class FitProblem:
 
     def blur(self, white: Array, level: Array, weights: Array) -> float:
         """By how much the noise of the model itself may change the cost."""
-        noise = self.model.rounding
+        noise = self.model.fitting.rounding
         if noise is None or self.white.ndim > 2:
             return 0.0
         off, share = self.white * noise / level, np.sqrt(weights)[:, None]

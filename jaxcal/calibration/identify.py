@@ -133,7 +133,7 @@ def identify(
     provenance = _provenance((u, y, weight), notes)
     model = require_fitting(_affine(n, m) if model is None else model, u, y)
     if accuracy is not None:
-        judged = model.accuracy_units(measured_unit)
+        judged = model.fitting.accuracy_units(measured_unit)
         if not judged:
             raise ValueError("accuracy needs an arm (model=)")
         provenance["accuracy"] = by_unit("accuracy", accuracy, judged)
@@ -164,7 +164,7 @@ def identify(
     fields |= {"input_names": inputs, "output_names": outputs}
     calibration = Calibration(**fields, **units)
     if prior is None and plain_noise:
-        calibration = model.improved(calibration)
+        calibration = model.fitting.improved(calibration)
     if sessions is not None:
         calibration = _with_sessions(calibration, sessions)
     # Of y = A u + b by as many rows as it needs the summary says that it is unchecked.
@@ -233,8 +233,9 @@ def _noise(
 ) -> tuple[Noise, bool]:
     """The noise as given, and whether that is at most a level of each output."""
     num_outputs = len(outputs)
-    noise_std = of_frame("noise_std", noise_std, outputs, MEASURED)
-    if not isinstance(noise, Noise):
+    if noise_std is not None:
+        noise_std = of_frame("noise_std", noise_std, outputs, MEASURED)
+    if noise is not None and not isinstance(noise, Noise):
         noise = as_noise(of_frame("noise", noise, outputs, MEASURED))
     if not (common_noise is None or isinstance(common_noise, bool)):
         labels = () if isinstance(common_noise, str) else np.atleast_1d(common_noise)
@@ -302,7 +303,7 @@ def _with_sessions(fit: Calibration, labels: ArrayLike) -> Calibration:
         rows = (which == label) & (fit.loss_weights > 0.0)
         if trial.noise_std is not None and rows.any():
             commands = fit.commands[rows]
-            off = fit.model.wrapped(
+            off = fit.model.fitting.wrapped(
                 fit.measured[rows] - trial.outputs_at(commands), commands
             )
             square.append(off**2)

@@ -229,7 +229,7 @@ class _Search(Responses):
         square = fit.num_inputs == wanted.shape[1]
         self.affine = square and fit.affine is not None
         # What the machine answers at commands (R, n) if points ``rows`` are reached.
-        self.goal = fit.model.targets(wanted, start)
+        self.goal = fit.model.fitting.targets(wanted, start)
         measured_at = fit.commands
         points, count = np.arange(len(wanted)), len(measured_at)
         there = self.goal(
@@ -237,9 +237,9 @@ class _Search(Responses):
         )
         outputs = predict(self.model, measured_at, fit.estimate)
         there = there.reshape(len(wanted), count, -1) - outputs
-        there = self.model.wrapped(there, measured_at)
+        there = self.model.fitting.wrapped(there, measured_at)
         # Relative outputs spread as what is wanted, seen from where it was measured.
-        spread = np.concatenate(there) if fit.model.relative else outputs
+        spread = np.concatenate(there) if fit.model.fitting.relative else outputs
         self.size = np.where(np.ptp(spread, axis=0) > 0.0, spread.std(axis=0), 1.0)
         with np.errstate(over="ignore"):
             order = np.argsort(((there / self.size) ** 2).sum(axis=-1), axis=1)
@@ -264,7 +264,7 @@ class _Search(Responses):
         """Warn of targets that are reached (P, n) far from what was measured."""
         fit = self.fit
         sides = [(fit.input_names, commands, fit.commands)]
-        if not fit.model.relative:
+        if not fit.model.fitting.relative:
             readings = predict(self.model, fit.commands, fit.estimate) + fit.residuals
             sides.insert(0, (fit.output_names, self.wanted, readings))
         say_far("target", fit.loss_weights > 0.0, sides, stacklevel=4)
@@ -272,7 +272,7 @@ class _Search(Responses):
     def gap(self, commands: Array, rows: Rows) -> Array:
         """(R, q) of points ``rows`` from the outputs at ``commands``, in sizes."""
         off = self.goal(commands, rows) - self.outputs(commands)
-        return np.asarray(self.model.wrapped(off, commands) / self.size)
+        return np.asarray(self.model.fitting.wrapped(off, commands) / self.size)
 
     def slopes(self, commands: Array) -> Array:
         """(P, q, n) in units of the spreads."""

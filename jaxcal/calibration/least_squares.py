@@ -141,7 +141,7 @@ class FitSolution:
                 self._predict()
             self.weights = np.ones(len(problem.measured))
             self.level = self._first_level()
-            self.facts, self.fact_rows = problem.model.facts(self.parameters)
+            self.facts, self.fact_rows = problem.model.fitting.facts(self.parameters)
             self._linearise()
         else:
             for name in _SHARED:
@@ -203,7 +203,7 @@ class FitSolution:
         """(N, q) measured less predicted."""
         model = self.problem.model
         predicted = predict(model, commands, theta, finite=finite)
-        return model.wrapped(self.problem.measured - predicted, commands)
+        return model.fitting.wrapped(self.problem.measured - predicted, commands)
 
     @functools.cached_property
     def sizes(self) -> Array:
@@ -363,7 +363,7 @@ class FitSolution:
             commands = self._moved(step)
             residuals = self._off(commands, theta, finite=False)
             white = self.whitened(residuals[..., None], theta)[..., 0]
-            facts, fact_rows = problem.model.facts(theta)
+            facts, fact_rows = problem.model.fitting.facts(theta)
             after = self._cost(white, theta, commands, facts)
             if last:
                 ratio = 1.0

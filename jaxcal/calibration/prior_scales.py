@@ -49,7 +49,7 @@ def group_scales(
     model is made linear at ``solution``; the search begins at ``start``, with factors
     of one where there is nothing."""
     p = len(problem.mean)
-    of_model = problem.model.error_groups()
+    of_model = problem.model.fitting.error_groups()
     assert of_model is not None
     groups, num_groups = of_model.members, len(of_model.medians)
     evidence = _Evidence(problem, solution, of_model)
@@ -178,7 +178,7 @@ def misfit_scale(
     squared factor."""
     more = len(with_misfit.names) - len(problem.mean)
     std = np.asarray(with_misfit.default_prior().std)[-more:]
-    groups = with_misfit.error_groups()
+    groups = with_misfit.fitting.error_groups()
     assert groups is not None
     beside = copy.copy(solution)
     beside.parameters = np.append(solution.parameters, np.zeros(more))
@@ -211,13 +211,13 @@ def misfit_scale(
 def covariance_of_scales(solution: FitSolution, scales: PriorScales) -> Array:
     """(P, P) what the scales, which are estimates too, add to the covariance: mean and
     covariance of a linear model's parameters are averaged over them."""
-    problem, of_model = solution.problem, solution.problem.model.error_groups()
+    problem, of_model = solution.problem, solution.problem.model.fitting.error_groups()
     assert of_model is not None
     free = problem.free
     groups = of_model.members[free]
     weights = np.sqrt(np.minimum(solution.weights, 1.0))[:, None, None]
     rows = (weights * solution.rows).reshape(-1, solution.rows.shape[-1])
-    fact_rows = problem.model.facts(solution.parameters)[1][:, free]
+    fact_rows = problem.model.fitting.facts(solution.parameters)[1][:, free]
     square = gram(rows) + fact_rows.T @ fact_rows
     precision = problem.precision[free]
     scale = 1.0 / np.sqrt(np.diagonal(square) + precision + 1e-300)

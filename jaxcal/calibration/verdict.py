@@ -202,12 +202,12 @@ def _far_off(fit: Fit) -> Reason | None:
     """Parameters whose estimates are far from where their prior, or a model's stated
     scale, has them."""
     p = len(fit.names)
-    if fit.model.off_by is None and not fit.prior_precision.any():
+    if fit.model.fitting.off_by is None and not fit.prior_precision.any():
         return None
     with np.errstate(divide="ignore"):
         expected = 1.0 / np.sqrt(fit.prior_precision[:p])
-    if fit.model.off_by is not None:
-        expected = np.minimum(expected, fit.model.off_by)
+    if fit.model.fitting.off_by is not None:
+        expected = np.minimum(expected, fit.model.fitting.off_by)
     away = np.abs(fit.estimate - fit.prior_mean)[:p] / expected
     far = int(away.argmax())
     if away[far] <= _FAR:
@@ -232,8 +232,10 @@ def _on_its_way(fit: Fit) -> Reason | None:
     pull += fit.prior_precision * (fit.prior_mean - fit.estimate)
     step = float(np.sqrt(max(pull @ covariance @ pull, 0.0)))
     least = _STEP
-    if fit.model.rounding is not None:  # its own noise moves the end of a search
-        share = np.asarray(fit.model.rounding) / fit.noise_std
+    if (
+        fit.model.fitting.rounding is not None
+    ):  # its own noise moves the end of a search
+        share = np.asarray(fit.model.fitting.rounding) / fit.noise_std
         least = max(least, 3.0 * float(np.sqrt(len(pull))) * float(share.max()))
     if step < least:
         return None
@@ -254,7 +256,7 @@ def wrong_noise(fit: Fit) -> Reason | None:
     noise, where = np.asarray(fit.noise_std), ""
     white, names = fit.residuals / noise, np.array(fit.output_names)
     squares = (white**2).sum(axis=0)
-    if fit.model.error_groups() is not None or not _in_noise(fit, white):
+    if fit.model.fitting.error_groups() is not None or not _in_noise(fit, white):
         squares, names = np.array([fit.square]), np.array([""])
     dof, chance = fit.dof / len(squares), UNLIKELY / len(squares)
     times = np.sqrt(np.maximum(squares, 1e-300) / dof)

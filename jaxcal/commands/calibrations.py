@@ -434,7 +434,7 @@ def predict(
     calibrated = Calibration.load(calibration)
     table = read_table(file)
     _, commands = commands_for(calibrated, table, inputs, radians=radians)
-    calibrated.model.require_commands(commands)
+    calibrated.model.fitting.require_commands(commands)
     names, values = calibrated.output_names, calibrated.predict(commands)
     if std:
         names = (*names, *(f"std_{name}" for name in names))

@@ -109,7 +109,7 @@ def postures(
         done = of_arm.commands(
             arm, reached, reached.named(header, COMMANDS, others=arm.sensor.outputs)
         )
-        arm.require_commands(done)
+        arm.fitting.require_commands(done)
         arm = arm.located(done)
     more = k - (0 if done is None else len(done))
     if more < 1:

@@ -159,7 +159,7 @@ class Ascent:
         """(N, n) of d by the commands, in shares of the limits."""
         box, (count, n) = self.box, commands.shape
         moving = len(box.allowed.limits) if box.surface else n  # joints, then labels
-        rough = _ROUGH if self.offer.model.resolution else _STEP
+        rough = _ROUGH if self.offer.model.fitting.resolution else _STEP
         step = (rough * box.span * np.eye(n))[:moving]
         ahead = np.minimum(commands[:, None] + step, box.limits[:, 1])
         back = np.maximum(commands[:, None] - step, box.limits[:, 0])
@@ -174,7 +174,7 @@ class Ascent:
     def spread(self) -> tuple[Array, Array]:
         """(R, n) points over the limits, where d is looked at, and their blocks."""
         model, box = self.offer.model, self.box
-        count = POOL if model.resolution or box.surface else _SEARCH
+        count = POOL if model.fitting.resolution or box.surface else _SEARCH
         count = affordable(model, box, self.deadline, 16, count)
         points = box.drawn(count, self.seed + 1)
         return points, self.blocks(points)

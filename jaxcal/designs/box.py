@@ -111,7 +111,7 @@ def affordable(
 ) -> int:
     """Points at which a model may be asked for derivatives in an eighth of the time:
     only a function's differences cost what it costs."""
-    if not model.resolution:
+    if not model.fitting.resolution:
         return most
     begun, points = time.perf_counter(), box.limits.mean(axis=1)[None].repeat(2, axis=0)
     points[1] += 0.1 * box.span

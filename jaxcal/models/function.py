@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -23,6 +24,7 @@ from jaxcal.checks import (
 )
 from jaxcal.models.differences import STENCILS, Differences, combined, look
 from jaxcal.models.model import (
+    Fitting,
     Model,
     Theta,
     as_commands,
@@ -38,6 +40,40 @@ _PILOTS = 4  # commands at which steps are chosen
 _ROUGH = 0.1  # of the largest derivative: a difference between orders that is told
 _LONG = 512  # rows of a table that is remembered as a whole
 _SETS = 6  # of parameters whose results are kept in memory
+
+
+class FunctionFitting(Fitting):
+    """How far a function can be differenced, and where it fails."""
+
+    model: FromFunction
+
+    @property
+    def off_by(self) -> Array | None:
+        return self.model.scale if self.model._stated else None
+
+    @property
+    def resolution(self) -> float:
+        """Share by which derivatives are off; 0 before the first."""
+        steps = self.model._steps.get("parameters")
+        return 0.0 if steps is None else min(steps.error, 1.0)
+
+    @property
+    def rounding(self) -> Array | None:
+        """(q,) noise of f, where it is more than that of double precision."""
+        steps = self.model._steps.get("parameters")
+        if steps is None or not (steps.noise > 1e-11 * steps.size).any():
+            return None
+        return steps.noise
+
+    def unanswered(self, commands: Array, parameters: Theta = None) -> dict[int, str]:
+        """Rows of commands (N, n) for which f fails at or near parameters, and why."""
+        model = self.model
+        slopes = model.jacobian(commands, as_parameters(model, parameters))
+        rows = model._asked(commands)
+        return {
+            int(i): model._reasons.get(rows[i].tobytes(), "it fails")
+            for i in np.flatnonzero(np.isnan(slopes).any(axis=(1, 2)))
+        }
 
 
 class FromFunction(Model):
@@ -90,7 +126,7 @@ class FromFunction(Model):
             raise ValueError("nominal must hold at least one parameter, got none")
         self.names = parameter_names(names, len(self.nominal))
         self.scale = self._scale(scale)
-        self.off_by = None if scale is None else self.scale
+        self._stated = scale is not None
         self._num_inputs: int | None = None
         self.inputs = ()  # names of the commands, where they have some
         if isinstance(inputs, int):
@@ -165,31 +201,9 @@ class FromFunction(Model):
         rows, theta = self._asked(commands), as_parameters(self, parameters)
         return self._steps_for("parameters", rows, theta)
 
-    @property
-    def resolution(self) -> float:
-        """Share by which derivatives are off; 0 before the first."""
-        steps = self._steps.get("parameters")
-        return 0.0 if steps is None else min(steps.error, 1.0)
-
-    @property
-    def rounding(self) -> Array | None:
-        """(q,) noise of f, where it is more than that of double precision."""
-        steps = self._steps.get("parameters")
-        if steps is None or not (steps.noise > 1e-11 * steps.size).any():
-            return None
-        return steps.noise
-
-    def unanswered(
-        self, commands: Array, parameters: ArrayLike | None = None
-    ) -> dict[int, str]:
-        """Rows of commands (N, n) for which f fails at or near parameters, and why."""
-        theta = as_parameters(self, parameters)
-        lost = np.isnan(self.jacobian(commands, theta)).any(axis=(1, 2))
-        rows = self._asked(commands)
-        return {
-            int(i): self._reasons.get(rows[i].tobytes(), "it fails")
-            for i in np.flatnonzero(lost)
-        }
+    @functools.cached_property
+    def fitting(self) -> FunctionFitting:
+        return FunctionFitting(self)
 
     def parameter_sizes(self) -> Array:
         """(p,) the scale."""

@@ -99,7 +99,7 @@ def identifiability(
     elif parameters is None:
         held = model.default_prior().fixed
         asked &= ~np.isin(model.names, list(held))
-    rows = np.vstack([rows, model.facts(mean)[1]])
+    rows = np.vstack([rows, model.fitting.facts(mean)[1]])
     if parameters is not None:
         parameters = [parameters] if isinstance(parameters, str) else parameters
         for name in parameters:
@@ -109,7 +109,7 @@ def identifiability(
     names = tuple(model.names[i] for i in at)
     std = np.sqrt(model.default_prior().resolve(model).precisions)[at]
     scale = 1.0 / np.where(std > 0.0, std, 1.0)
-    null, size = _null_space(rows[:, at] * scale, model.resolution)
+    null, size = _null_space(rows[:, at] * scale, model.fitting.resolution)
     directions = []
     for local in null:
         full = np.zeros((len(local), model.num_parameters))

@@ -57,6 +57,96 @@ class Quantity(NamedTuple):
         return np.linalg.norm(off[..., self.columns], axis=-1) / np.sqrt(self.points)
 
 
+class Fitting:
+    """What a fit, a choice or a check asks of a model besides f: ``model.fitting``.
+
+    These are the answers of most models; arms have their own. A model of one's own that
+    answers otherwise has a property ``fitting`` of a class that derives from this.
+    """
+
+    off_by: Any = None  # (p,) from nominal, that parameters may be, as stated
+    resolution: Any = 0.0  # share by which derivatives by differences err
+    rounding: Any = None  # (q,) std of its own noise, as of printed digits
+    relative: Any = False  # readings are relative to the commands, as turns
+    sensed: Any = slice(0, 0)  # columns of commands that a reading brings
+    placed: Any = ()  # parameters of what stands around it
+    slips: Any = ()  # parameters that change when something slips
+    misfit_std: Any = 0.0  # of a reading, what ``with_misfit`` leaves
+    fits_misfit: Any = False  # ``with_misfit`` is fitted without a prior
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+
+    def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
+        """Units in which ``identify`` may be asked for an accuracy; () of none."""
+        return ()
+
+    def facts(self, parameters: Theta = None) -> tuple[Array, Array]:
+        """What is known besides the prior: (F,) how far off it is and (F, p) its
+        derivative, in standard deviations."""
+        return np.zeros(0), np.zeros((0, len(self.model.names)))
+
+    def error_groups(self) -> ErrorGroups | None:
+        """The scales that ``Prior.sized()`` takes from the readings; None without."""
+        return None
+
+    def log_size(self, commands: Array, parameters: Array) -> Array | None:
+        """Logarithm (N,) of what contacts' readings, near zero, grow with. A fit
+        compares them (below four times ``default_noise``) with the machine's size, or a
+        smaller one would always fit better. None: readings are as large as they are."""
+        return None
+
+    def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
+        """(N, p) derivative of ``log_size``, zero by parameters at which it is held."""
+        return np.zeros((len(commands), len(self.model.names)))
+
+    def wrapped(self, off: Array, commands: Array) -> Array:
+        """(N, q) differences of readings, those that wrap within half a period."""
+        return within_half(off, self.model.periods)
+
+    def unanswered(self, commands: Array, parameters: Theta = None) -> dict[int, str]:
+        """Rows of commands (N, n) for which the model fails, and why."""
+        return {}
+
+    def anew(self, commands: Array, measured: Array) -> Any:
+        """The model as ``prepared`` has it, where its sensor stood before forgotten."""
+        return self.model
+
+    def prepared(self, commands: Array, measured: Array | None = None) -> Any:
+        """The model where the commands (and readings) show that its sensor stands; a
+        ValueError where no such machine takes the commands, or gives the readings."""
+        self.require_commands(commands)
+        return self.model
+
+    def require_commands(self, commands: Array) -> None:
+        """Refuse commands (N, n) that the machine cannot take, naming one."""
+        return
+
+    def distinct(self, commands: Array, measured: Array) -> Rows:
+        """(K,) the rows that count; the same contact written twice counts once."""
+        return np.arange(len(commands))
+
+    def improved(self, fit: Any) -> Any:
+        """A ``jaxcal.Calibration`` by default prior and noise, or a better one."""
+        return fit
+
+    def unexplained(self, fit: Any, rows: Array) -> Array:
+        """(N, q) std of predictions by what neither parameters nor noise explain."""
+        return np.zeros((len(rows), self.model.num_outputs))
+
+    def targets(
+        self, desired: Array, start: Array | None
+    ) -> Callable[[Array, Rows], Array]:
+        """f(commands (R, n), rows (R,)) -> (R, q), what the machine answers there if it
+        reaches those rows of ``desired`` (P, q); ``start`` (P, n) of the searches."""
+        return lambda commands, rows: desired[rows]
+
+    def verdict(self, fit: Any) -> Any:
+        """Whether a ``jaxcal.Calibration`` can be trusted: a ``Verdict`` of this kind
+        of model; None: by the rules for every model."""
+        return None
+
+
 class Model(abc.ABC):
     """n commands, p parameters, q outputs; everything is float64 in the caller's units.
 
@@ -78,18 +168,9 @@ class Model(abc.ABC):
         def num_outputs(self) -> int: ...
 
     inputs: Any = ()
-    off_by: Any = None  # (p,) from nominal, that parameters may be, as stated
     linear: ClassVar[Any] = False  # ``f(u; theta) = J(u) theta``, J exact
     multiplicity: ClassVar[Any] = 0  # m where all outputs share one regressor
-    relative: ClassVar[Any] = False  # readings are relative to the commands, as turns
     periods: ClassVar[Any] = None  # (q,) of readings that wrap, as 360; inf: does not
-    resolution: ClassVar[Any] = 0.0  # share by which derivatives by differences err
-    rounding: ClassVar[Any] = None  # (q,) std of its own noise, as of printed digits
-    sensed: ClassVar[Any] = slice(0, 0)  # columns of commands that a reading brings
-    placed: ClassVar[Any] = ()  # parameters of what stands around it
-    slips: ClassVar[Any] = ()  # parameters that change when something slips
-    misfit_std: ClassVar[Any] = 0.0  # of a reading, what ``with_misfit`` leaves
-    fits_misfit: ClassVar[Any] = False  # ``with_misfit`` is fitted without a prior
 
     # -- f and its derivatives ---------------------------------------------------------
 
@@ -123,10 +204,6 @@ class Model(abc.ABC):
         """What the readings are of, each with its unit: one where all share it."""
         return (Quantity(measured_unit),)
 
-    def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
-        """Units in which ``identify`` may be asked for an accuracy; () of none."""
-        return ()
-
     def meanings(self, inputs: Sequence[str], outputs: Sequence[str]) -> list[str]:
         """p meanings of the parameters in a summary; [] where the names tell."""
         return []
@@ -157,63 +234,12 @@ class Model(abc.ABC):
             sizes = np.where(precision > 0.0, 1.0 / np.sqrt(precision), nominal)
         return np.where(sizes > 0.0, sizes, np.nan)
 
-    def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
-        """What is known besides the prior: (F,) how far off it is and (F, p) its
-        derivative, in standard deviations."""
-        return np.zeros(0), np.zeros((0, len(self.names)))
+    # -- what is asked of it -----------------------------------------------------------
 
-    def error_groups(self) -> ErrorGroups | None:
-        """The scales that ``Prior.sized()`` takes from the readings; None without."""
-        return None
-
-    def log_size(self, commands: Array, parameters: Array) -> Array | None:
-        """Logarithm (N,) of what contacts' readings, near zero, grow with. A fit
-        compares them (below four times ``default_noise``) with the machine's size, or a
-        smaller one would always fit better. None: readings are as large as they are."""
-        return None
-
-    def log_size_jacobian(self, commands: Array, parameters: Array) -> Array:
-        """(N, p) derivative of ``log_size``, zero by parameters at which it is held."""
-        return np.zeros((len(commands), len(self.names)))
-
-    def wrapped(self, off: Array, commands: Array) -> Array:
-        """(N, q) differences of readings, those that wrap within half a period."""
-        return within_half(off, self.periods)
-
-    def unanswered(
-        self, commands: Array, parameters: ArrayLike | None = None
-    ) -> dict[int, str]:
-        """Rows of commands (N, n) for which the model fails, and why."""
-        return {}
-
-    # -- the commands and readings of a fit or a choice --------------------------------
-
-    def anew(self, commands: Array, measured: Array) -> Model:
-        """The model as ``prepared`` has it, where its sensor stood before forgotten."""
-        return self
-
-    def prepared(self, commands: Array, measured: Array | None = None) -> Model:
-        """This model where the commands (and readings) show that its sensor stands; a
-        ValueError where no such machine takes the commands, or gives the readings."""
-        self.require_commands(commands)
-        return self
-
-    def require_commands(self, commands: Array) -> None:
-        """Refuse commands (N, n) that the machine cannot take, naming one."""
-        return
-
-    def recorded(self, recording: Recording) -> tuple[Array, Array | None]:
-        """Commands (N, n) of a recording, and readings (N, q) if it has them."""
-        raise self._no_arm()
-
-    def distinct(self, commands: Array, measured: Array) -> Rows:
-        """(K,) the rows that count; the same contact written twice counts once."""
-        return np.arange(len(commands))
-
-    def centred(self, centre: Array) -> Array | None:
-        """(p, p) with ``f(u; theta) = f(u - centre; centred(centre) @ theta)``, or
-        None."""
-        return None
+    @functools.cached_property
+    def fitting(self) -> Fitting:
+        """What a fit asks of it besides f."""
+        return Fitting(self)
 
     def blocks(self, commands: ArrayLike) -> Array:
         """(..., N, 1, r) of each output by itself, with unit noise."""
@@ -223,44 +249,18 @@ class Model(abc.ABC):
         """A (m, n) and b (m,) of a model ``y = A u + b``; None for any other."""
         return None
 
-    # -- what no parameter explains ----------------------------------------------------
+    def centred(self, centre: Array) -> Array | None:
+        """(p, p) with ``f(u; theta) = f(u - centre; centred(centre) @ theta)``, or
+        None."""
+        return None
 
     def with_misfit(self) -> Model:
         """This model with more parameters, which come last: what the others leave."""
         return self
 
-    def improved(self, fit: Any) -> Any:
-        """A ``jaxcal.Calibration`` by default prior and noise, or a better one."""
-        return fit
-
-    def unexplained(self, fit: Any, rows: Array) -> Array:
-        """(N, q) std of predictions by what neither parameters nor noise explain."""
-        return np.zeros((len(rows), self.num_outputs))
-
-    # -- a calibrated machine ----------------------------------------------------------
-
-    def targets(
-        self, desired: Array, start: Array | None
-    ) -> Callable[[Array, Rows], Array]:
-        """f(commands (R, n), rows (R,)) -> (R, q), what the machine answers there if it
-        reaches those rows of ``desired`` (P, q); ``start`` (P, n) of the searches."""
-        return lambda commands, rows: desired[rows]
-
-    def verdict(self, fit: Any) -> Any:
-        """Whether a ``jaxcal.Calibration`` can be trusted: a ``Verdict`` of this kind
-        of model; None: by the rules for every model."""
-        return None
-
-    def calibrated(self, parameters: ArrayLike) -> Model:
-        """The machine whose nominal is this one's with ``parameters``."""
-        raise self._no_arm()
-
     @property
     def _kind(self) -> str:
         return type(self).__name__
-
-    def _no_arm(self) -> ValueError:
-        return ValueError(f"the model must be an arm, got {self._kind}")
 
 
 class _Adapter(Model):
@@ -304,6 +304,13 @@ def as_model(model: Any) -> Model:
     return _Adapter(model)
 
 
+def of_arm(model: Any, name: str) -> Any:
+    """What only arms have, by its name; a ValueError of another model."""
+    if not hasattr(model, name):
+        raise ValueError(f"the model must be an arm, got {as_model(model)._kind}")
+    return getattr(model, name)
+
+
 def as_commands(model: Any, commands: ArrayLike) -> Array:
     """``commands`` as finite float64 (N, n); of a data frame the model's columns."""
     commands = by_name(model, commands)
@@ -343,7 +350,7 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
     if is_recording:
         if model is None:
             raise ValueError("commands are a recording: model must be an arm")
-        commands, read = as_model(model).recorded(commands)
+        commands, read = of_arm(model, "recorded")(commands)
         measured = read if measured is None else measured
     elif measured is None and getattr(
         getattr(model, "sensor", None), "contacts", False

@@ -72,7 +72,7 @@ def answered(
 ) -> NDArray[np.bool_]:
     """(N,) where the model has a prediction; a warning names the others, by the numbers
     of their ``rows`` (N,), or ``names`` of all rows."""
-    lost = model.unanswered(commands, parameters) if len(commands) else {}
+    lost = model.fitting.unanswered(commands, parameters) if len(commands) else {}
     mask = np.ones(len(commands), dtype=np.bool_)
     if lost:
         mask[list(lost)] = False

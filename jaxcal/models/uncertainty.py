@@ -55,8 +55,10 @@ class Prior:
     def __post_init__(self) -> None:
         if isinstance(self.fixed, str) or not isinstance(self.fixed, Collection):
             raise ValueError(f"fixed must be a sequence of names, got {self.fixed!r}")
-        stds = by_name("std of the prior", self.std)
-        stds = [*stds.values()] if isinstance(stds, Mapping) else stds
+        stds: Any = self.std
+        if type(stds) is not float:
+            stds = by_name("std of the prior", stds)
+            stds = [*stds.values()] if isinstance(stds, Mapping) else stds
         std = numbers("std of the prior", stds, finite=False)
         if not (std > 0.0).all():
             raise ValueError(
@@ -89,7 +91,8 @@ def _by_name(
     argument: str, values: PerParameter | None, names: tuple[str, ...], default: Any
 ) -> Array:
     """(p,) ``values`` in the order of ``names``; ``default`` where they are silent."""
-    values = by_name(argument, values)
+    if values is not None:
+        values = by_name(argument, values)
     if values is None or isinstance(values, Mapping):
         result = np.empty(len(names))
         result[:] = default
@@ -113,17 +116,18 @@ class Noise:
     command_std: ArrayLike | None = None
 
     def __post_init__(self) -> None:
-        for name, values in vars(self).items():
-            require_unnamed(f"{name} of the noise", values)
         if self.std is not None and self.covariance is not None:
             raise ValueError("give std or covariance of the noise, not both")
         if self.std is not None:
+            require_unnamed("std of the noise", self.std)
             std = numbers("std of the noise", self.std)
             require_none(~(std > 0.0), std, "std of the noise must be positive")
         if self.covariance is not None:
+            require_unnamed("covariance of the noise", self.covariance)
             numbers("covariance of the noise", self.covariance)
         if self.command_std is None:
             return
+        require_unnamed("command_std of the noise", self.command_std)
         spread = numbers("command_std", self.command_std, finite=False)
         rule = "command_std must not be negative (inf: unknown in every measurement)"
         require_none(~(spread >= 0.0), spread, rule)

@@ -288,7 +288,9 @@ def _new_section(
 ) -> pages.Section:
     commands = calibration.points("commands", commands, calibration.num_inputs)
     off = calibration.points("measured", measured, calibration.num_outputs)
-    off = calibration.model.wrapped(off - calibration.outputs_at(commands), commands)
+    off = calibration.model.fitting.wrapped(
+        off - calibration.outputs_at(commands), commands
+    )
     std = calibration.predict_std(commands, new_measurement=True)
     kinds = ("off", "off in standard deviations")
     head = [f"{name} {kind}" for kind in kinds for name in calibration.output_names]
@@ -411,7 +413,7 @@ def nominal_errors(calibration: Fit) -> Array | None:
     measured = calibration.measured
     if calibration.affine is None:
         model, commands = calibration.model, calibration.commands
-        return model.wrapped(measured - model.predict(commands), commands)
+        return model.fitting.wrapped(measured - model.predict(commands), commands)
     inputs = [name.removeprefix(COMMANDS) for name in calibration.input_names]
     outputs = [name.removeprefix(MEASURED) for name in calibration.output_names]
     if {*inputs} != {*outputs} or len(inputs) != len(outputs):

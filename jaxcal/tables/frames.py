@@ -55,7 +55,10 @@ def header_of(argument: str, values: Any) -> list[str]:
 
 def by_name(argument: str, values: Any) -> Any:
     """A row that has names as a dict, else as given."""
-    if isinstance(values, Mapping) or not (names := header_of(argument, values)):
+    if values is None or isinstance(values, int | float | Mapping):
+        return values
+    names = header_of(argument, values)
+    if not names:
         return values
     return {name: _column(values, name) for name in names}
 

@@ -188,7 +188,10 @@ def test_intervals_hold_the_truth_and_predictions_err_as_stated(name, kind):
             low, high = fit.confidence_intervals().T
             inside.append(((low <= truth) & (truth <= high))[judged].mean())
             exact = bent.predict(elsewhere, whole)
-            off = fit.model.wrapped(fit.predict(elsewhere) - exact, elsewhere) / noise
+            off = (
+                fit.model.fitting.wrapped(fit.predict(elsewhere) - exact, elsewhere)
+                / noise
+            )
             stated = fit.predict_std(elsewhere) / noise
             squares.append([np.mean(stated**2), np.mean(off**2)])
         mean, error = np.mean(inside), 2.0 * np.std(inside) / np.sqrt(len(inside))

@@ -218,12 +218,12 @@ def test_the_covariance_of_what_may_be_there_is_that_of_a_dense_formula():
     )
     p, free = len(found.names), found.free > 0.0
     slopes = found.whole.jacobian(commands, found.estimate)
-    log = found.whole.log_size(commands, found.estimate)  # misses are by size
-    by_size = found.whole.log_size_jacobian(commands, found.estimate)
+    log = found.whole.fitting.log_size(commands, found.estimate)  # misses are by size
+    by_size = found.whole.fitting.log_size_jacobian(commands, found.estimate)
     off = found.predict(commands)
     slopes = slopes - off[..., None] * by_size[:, None]
     start = np.append(found.prior_mean[:p], np.zeros(28))
-    size = np.exp(log - found.whole.log_size(commands, start))
+    size = np.exp(log - found.whole.fitting.log_size(commands, start))
     slopes = (slopes / size[:, None, None]).reshape(-1, p + 28) / 2e-4
     fitted, waves = slopes[:, :p][:, free[:p]], slopes[:, p:]
     precision = np.diag(found.prior_precision[:p][free[:p]])

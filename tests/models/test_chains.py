@@ -311,20 +311,20 @@ def test_hands_may_touch_sockets_that_the_other_does_not():
         contacts = chain.postures(20, near=places)
         given[name] = contacts[contacts[:, 6] != without], None
     commands, measured = pair.together(given)
-    prepared = pair.prepared(commands, measured)  # as identify begins
+    prepared = pair.fitting.prepared(commands, measured)  # as identify begins
     assert [one.sensor.distances for one in prepared.chains] == [sensor.distances] * 2
     unplaced = Socket(3, distances=sensor.distances)
     arms = {
         n: c.measured_with(unplaced)
         for n, c in zip(pair.tips, pair.chains, strict=True)
     }
-    for one in Chains.of(arms).prepared(commands, measured).chains:
+    for one in Chains.of(arms).fitting.prepared(commands, measured).chains:
         np.testing.assert_allclose(one.sensor.places, places, atol=1e-3)
     with pytest.raises(ValueError, match="contacts of socket 2, whose distance"):
-        arm.prepared(given["one"][0], np.zeros((len(given["one"][0]), 3)))
+        arm.fitting.prepared(given["one"][0], np.zeros((len(given["one"][0]), 3)))
     which = commands[:, pair.inputs.index("socket")]
     with pytest.raises(ValueError, match="contacts of socket 2, whose distance"):
-        pair.prepared(commands[which != 2.0], measured[which != 2.0])
+        pair.fitting.prepared(commands[which != 2.0], measured[which != 2.0])
 
 
 HANDS = ("left_hand", "right_hand")
@@ -415,7 +415,7 @@ def test_what_hands_share_in_several_has_one_place(kind, tmp_path):
     own = THINGS[kind].names
     assert set(own) <= set(robot.names)
     assert not any(f"{tip}: {name}" in robot.names for tip in HANDS for name in own)
-    arms = robot.prepared(commands, measured).chains
+    arms = robot.fitting.prepared(commands, measured).chains
     for arm in arms:
         one = arm.sensor.sensors[0]
         if kind == "board":
@@ -458,16 +458,16 @@ def test_a_shared_board_takes_three_views_by_each_camera(tmp_path):
     right = np.flatnonzero(~views | (chain == 1))
     left = np.flatnonzero(views & (chain == 0))
     kept = np.concatenate([left[:3], right])
-    arm = robot.prepared(commands[kept], measured[kept]).chains[0]
+    arm = robot.fitting.prepared(commands[kept], measured[kept]).chains[0]
     hand = np.linalg.inv(robot.chains[0].tool) @ arm.tool
     np.testing.assert_allclose(hand, CAMERA, atol=0.03)
     np.testing.assert_allclose(arm.sensor.sensors[0].place, BOARD, atol=0.02)
     few = np.concatenate([left[:2], right])
     with pytest.raises(ValueError, match=r"left_hand: .* 2 views .* 3 views by one"):
-        robot.prepared(commands[few], measured[few])
+        robot.fitting.prepared(commands[few], measured[few])
     commands[chain == 0, :7] = np.radians(commands[chain == 0, :7])
     with pytest.raises(ValueError, match="left_hand: commands must be in degrees"):
-        robot.prepared(commands, measured)
+        robot.fitting.prepared(commands, measured)
 
 
 @pytest.mark.slow
@@ -526,7 +526,7 @@ def test_a_distance_in_several_that_no_hand_touches_is_refused(tmp_path):
         for tip, arm in zip(HANDS, robot.chains, strict=True)
     }
     with pytest.raises(ValueError, match="contacts of socket 2, whose distance"):
-        robot.prepared(*robot.together(tables))
+        robot.fitting.prepared(*robot.together(tables))
 
 
 def test_the_base_is_held_of_one_of_the_arms_that_show_where_the_others_stand():
@@ -558,14 +558,14 @@ def test_hands_that_are_tracked_from_elsewhere_keep_one_torso(robot, tmp_path):
     points = read(tmp_path / "robot.urdf", robot, commands) * scale
     noise = np.random.default_rng(0).normal(0, 1e-4, points.shape)
     moved = (turn.apply(points) + np.array([3.0, 1.0, 0.0]) + noise) / scale
-    prepared = robot.prepared(commands, moved)
+    prepared = robot.fitting.prepared(commands, moved)
     assert prepared.names == robot.names
     off = (prepared.predict(commands) - moved) * scale
     assert np.abs(off).max() < 0.01
     second = commands[:, len(robot.joint_names)] == 1.0
     moved[second] = moved[second] + 2.0 / scale  # another tracker, 2 m away
     with pytest.raises(ValueError, match="in different frames"):
-        robot.prepared(commands, moved)
+        robot.fitting.prepared(commands, moved)
 
 
 def test_an_arm_that_three_readings_leave_open_is_not_good_beside_another():

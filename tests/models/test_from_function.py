@@ -59,7 +59,7 @@ def test_derivatives_are_those_by_hand_in_any_unit(unit):
     scale = np.array([1.0, unit, unit])
     np.testing.assert_allclose(one.jacobian(U * unit), exact * scale, atol=1e-7 * unit)
     np.testing.assert_allclose(one.command_jacobian(U * unit), by_command, atol=1e-7)
-    assert one.resolution <= 1e-8
+    assert one.fitting.resolution <= 1e-8
 
 
 @pytest.mark.parametrize("noise", [1e-10, 1e-6, 1e-3])

@@ -77,14 +77,14 @@ def test_corners_outside_the_picture_are_named():
     assert ((pixels > 0.0) & (pixels < CAMERA[:2])).all()
     narrow = arm.measured_with(Board("camera", PLACE, CORNERS, CAMERA[2:]))
     np.testing.assert_array_equal(narrow.predict(joints), arm.predict(joints))
-    arm.prepared(joints, arm.predict(joints))
-    arm.prepared(joints, _at_left(pixels, 3, -0.0005).reshape(8, -1))  # noise
+    arm.fitting.prepared(joints, arm.predict(joints))
+    arm.fitting.prepared(joints, _at_left(pixels, 3, -0.0005).reshape(8, -1))  # noise
     with pytest.raises(ValueError, match=r"1 of 8 board rows .* of row 3 is at"):
-        arm.prepared(joints, _at_left(pixels, 3, -0.01).reshape(8, -1))
+        arm.fitting.prepared(joints, _at_left(pixels, 3, -0.01).reshape(8, -1))
     aside = joints.copy()
     aside[5, 4] += 180.0  # the camera looks away
     with pytest.warns(UserWarning, match="1 of 8 candidates .* row 5 of the available"):
-        arm.prepared(aside)
+        arm.fitting.prepared(aside)
 
 
 def _at_left(pixels, row, share):
@@ -98,8 +98,8 @@ def test_a_board_without_corners_takes_a_camera_for_its_postures():
     posed = Board("camera", PLACE, extent=(200.0, 150.0), camera=CAMERA)
     arm = SerialChain.from_dh(ur5().table, tool=MOUNT, sensor=posed)
     candidates = arm.postures(12, seed=2)
-    arm.prepared(candidates)
-    arm.prepared(candidates, arm.predict(candidates) - 80.0)  # poses, no pixels
+    arm.fitting.prepared(candidates)
+    arm.fitting.prepared(candidates, arm.predict(candidates) - 80.0)  # poses, no pixels
     with pytest.raises(ValueError, match=r"camera must be .*, got \(640.0, 480.0\)"):
         Board("camera", PLACE, camera=(640.0, 480.0))
 

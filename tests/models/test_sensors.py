@@ -427,18 +427,18 @@ def test_sockets_planes_and_anchors_are_found_from_nominal_postures():
 
 def test_distances_between_sockets_are_facts():
     model = ur5(sensor=Socket(2, SOCKETS, distances=[(0, 1, 49.0, 0.1)]))
-    off, rows = model.facts()
+    off, rows = model.fitting.facts()
     np.testing.assert_allclose(off, [-10.0])
-    numeric = differences(lambda at: -model.facts(at)[0], model.nominal)
+    numeric = differences(lambda at: -model.fitting.facts(at)[0], model.nominal)
     np.testing.assert_allclose(rows, numeric, atol=1e-6)
     both = ur5(sensor=Several((Position(), model.sensor)))
-    off, rows = both.facts()
+    off, rows = both.fitting.facts()
     assert off[0] == pytest.approx(-10.0)
     assert [n for n, r in zip(both.names, rows[0], strict=True) if r] == [
         "socket0 y",
         "socket1 y",
     ]
-    assert ur5().facts()[1].shape == (0, 39)
+    assert ur5().fitting.facts()[1].shape == (0, 39)
 
 
 def test_wrong_readings_of_one_of_several_sensors_are_refused():

@@ -300,14 +300,16 @@ def test_contacts_are_missed_by_more_by_a_larger_arm_wherever_it_stands():
     commands = np.random.default_rng(0).uniform(-150.0, 150.0, (9, 7))
     names, length = np.array(arm.names), np.array(arm.units) == "length"
     theta = arm.nominal + np.where(length, 1.0, 0.3)
-    slopes = arm.log_size_jacobian(commands, theta)
-    larger = arm.log_size(commands, np.where(length, 1.3, 1.0) * theta)
-    np.testing.assert_allclose(larger - arm.log_size(commands, theta), np.log(1.3))
-    by_lengths = differences(lambda t: arm.log_size(commands, t), theta)
+    slopes = arm.fitting.log_size_jacobian(commands, theta)
+    larger = arm.fitting.log_size(commands, np.where(length, 1.3, 1.0) * theta)
+    np.testing.assert_allclose(
+        larger - arm.fitting.log_size(commands, theta), np.log(1.3)
+    )
+    by_lengths = differences(lambda t: arm.fitting.log_size(commands, t), theta)
     np.testing.assert_allclose(slopes[:, length], by_lengths[:, length], atol=1e-9)
     stands = slopes[:, np.isin(names, ["d1", "base x"])]
     np.testing.assert_allclose(stands, 0.0, atol=1e-15)
-    assert arm.measured_with(Position()).log_size(commands, theta) is None
+    assert arm.measured_with(Position()).fitting.log_size(commands, theta) is None
     # On a rail that stands still it is the same arm; the rail's way shows the size.
     rows = [(0, -90, 0, 0), *np.array(UR5_TABLE)[:, :4].tolist()]
     rail = SerialChain.from_dh(
@@ -315,16 +317,17 @@ def test_contacts_are_missed_by_more_by_a_larger_arm_wherever_it_stands():
     )
     along = np.column_stack([np.full(9, 700.0), commands])
     np.testing.assert_allclose(
-        rail.log_size(along, rail.nominal), arm.log_size(commands, arm.nominal)
+        rail.fitting.log_size(along, rail.nominal),
+        arm.fitting.log_size(commands, arm.nominal),
     )
-    slopes = rail.log_size_jacobian(along, rail.nominal)
-    by_all = differences(lambda t: rail.log_size(along, t), rail.nominal)
+    slopes = rail.fitting.log_size_jacobian(along, rail.nominal)
+    by_all = differences(lambda t: rail.fitting.log_size(along, t), rail.nominal)
     length = np.array(rail.units) == "length"
     np.testing.assert_allclose(slopes[:, length], by_all[:, length], atol=1e-9)
     along[0, 0] = 701.0  # jitter
-    assert rail.log_size(along, rail.nominal) is not None
+    assert rail.fitting.log_size(along, rail.nominal) is not None
     along[0, 0] = 800.0
-    assert rail.log_size(along, rail.nominal) is None
+    assert rail.fitting.log_size(along, rail.nominal) is None
 
 
 def test_an_arm_whose_joint_follows_another_stands_as_one_elsewhere():

@@ -63,7 +63,7 @@ def recorded(arm: Chain, recording: Recording) -> tuple[Array, Array | None]:
     pixels = sensor.views and not views
     commands, read = _rests_of(arm, recording, "" if pixels else sensor.kind)
     matrices = np.zeros((len(commands), 3, 3))
-    if read is not None and (views or arm.relative):
+    if read is not None and (views or arm.fitting.relative):
         matrices = read[:, 3:].reshape(-1, 3, 3).swapaxes(1, 2)
     if views:
         if read is None:
@@ -80,7 +80,7 @@ def recorded(arm: Chain, recording: Recording) -> tuple[Array, Array | None]:
         commands = np.column_stack([commands, numbers("which", which)])
     if sensor.zeros:
         return commands, np.zeros((len(commands), len(sensor.outputs)))
-    if read is not None and arm.relative:
+    if read is not None and arm.fitting.relative:
         read = np.hstack([read[:, :3], arm.rotation_vectors(commands, matrices)])
     return commands, read
 

@@ -93,7 +93,7 @@ class Table:
     @property
     def sensed(self) -> int:
         """Columns of the commands that come with the readings."""
-        return self.commands[:, self.model.sensed].shape[1]
+        return self.commands[:, self.model.fitting.sensed].shape[1]
 
     @property
     def levels(self) -> int:
@@ -110,7 +110,7 @@ class Table:
     def commands_of(self, hypothesis: Hypothesis, rows: Rows) -> Array:
         """(K, n) commands that the readings of these rows belong to."""
         commands = self.commands[hypothesis.match[rows]]
-        sensed = self.model.sensed
+        sensed = self.model.fitting.sensed
         commands[:, sensed] = self.commands[rows, sensed]
         change = hypothesis.change
         if change is not None and not change.of_readings:
@@ -130,7 +130,7 @@ class Table:
         off = self.readings_of(hypothesis, rows) - predict(
             self.model, commands, theta, finite=False
         )
-        return np.asarray(self.model.wrapped(off, commands) / self.scale)
+        return np.asarray(self.model.fitting.wrapped(off, commands) / self.scale)
 
     def system(self, hypothesis: Hypothesis, rows: Rows) -> tuple[Array, Array]:
         """The readings as linear in what is free, less its mean: (K, a, r) and

@@ -130,7 +130,7 @@ def _taken_up(fit: Fit) -> Mispairing | None:
     assert change is not None
     reason = f"{change.words}, for the nominal parameters explain it then and not now"
     noise = nominal.noise * table.scale
-    return Mispairing("columns", reason, noise, match, change, fit.model.sensed)
+    return Mispairing("columns", reason, noise, match, change, fit.model.fitting.sensed)
 
 
 def of_unfitted(
@@ -203,7 +203,7 @@ def _table(
     where there is too little."""
     resolved = prior.resolve(model)
     free = resolved.free & (not held)
-    most = _RUNS if model.resolution else _ROWS
+    most = _RUNS if model.fitting.resolution else _ROWS
     commands, measured = commands[:most], measured[:most]
     counted = np.ones(len(commands), np.bool_) if counted is None else counted[:most]
     flat = bool((resolved.precisions == 0.0).all() and free.all())
@@ -223,7 +223,7 @@ def _table(
     if not spread.any():  # a sensor that reads zero where all is as it should be
         half = np.roll(np.arange(len(commands)), len(commands) // 2)
         paired = commands[half]
-        paired[:, model.sensed] = commands[:, model.sensed]
+        paired[:, model.fitting.sensed] = commands[:, model.fitting.sensed]
         spread = np.sqrt((model.predict(paired, resolved.mean) ** 2).mean(axis=0))
     spread = np.where(spread > 0.0, spread, 1.0)
     usual, scale = model.default_noise(), spread
@@ -298,7 +298,7 @@ def _found(
         best.noise * table.scale,
         match,
         best.hypothesis.change,
-        table.model.sensed,
+        table.model.fitting.sensed,
         tuple(others),
     )
 

@@ -63,7 +63,7 @@ def changed_columns(
     table: Table, plain: Fitted, inputs: Names, outputs: Names
 ) -> list[Fitted]:
     """Columns with another sign, unit or place."""
-    least = 0.1 if table.model.resolution else 0.02
+    least = 0.1 if table.model.fitting.resolution else 0.02
     if table.shared or not (plain.rms > least * table.width).any():
         return []
     tables, every = [], np.flatnonzero(table.counted)
@@ -126,9 +126,9 @@ def _unexplained(
         outputs = predict(table.model, commands, table.mean, finite=False)
     with np.errstate(all="ignore"):
         ratio = (readings * outputs).sum(axis=0) / (outputs**2).sum(axis=0)
-        most = _FACTOR if table.model.off_by is None else _FACTOR_STATED
+        most = _FACTOR if table.model.fitting.off_by is None else _FACTOR_STATED
         off = readings - outputs * np.clip(ratio, 1.0 / most, most)
-        off = table.model.wrapped(off, commands)
+        off = table.model.fitting.wrapped(off, commands)
         share = (off**2).sum(axis=0) / (readings.var(axis=0) * len(rows))
     return np.nan_to_num(share, nan=np.inf, posinf=np.inf)
 
@@ -142,7 +142,7 @@ def _kinds_of_columns(
     tables = [(inputs, moved, False)]
     # A machine that hardly moves has zero readings everywhere, as contacts.
     read = table.measured.any()
-    if read and not table.model.relative:
+    if read and not table.model.fitting.relative:
         tables.append((outputs, len(outputs), True))
     ways = {"has the other sign": -1.0} | (_UNITS if read else {})
     changes: list[ColumnChange] = []
@@ -206,7 +206,7 @@ def _multiple(table: Table, theta: Array) -> float:
         alike = times.max() < _ALIKE * times.min()
         if not (alike and times.min() > 0.0 and (rest < _MULTIPLE).all()):
             return 0.0
-    most = _FACTOR if table.model.off_by is None else _FACTOR_STATED
+    most = _FACTOR if table.model.fitting.off_by is None else _FACTOR_STATED
     near_unit = (apart < np.log(most)).all(axis=1).any()
     return 0.0 if near_unit else float(np.median(times))
 
@@ -232,7 +232,7 @@ def _anew(table: Table, hypothesis: Hypothesis, rows: Rows) -> Table | None:
     if not table.free.any():
         return table
     try:
-        model = table.model.anew(
+        model = table.model.fitting.anew(
             table.commands_of(hypothesis, rows), table.readings_of(hypothesis, rows)
         )
     except ValueError:

@@ -340,7 +340,7 @@ def _proof(
         better = max if criterion.larger_is_better else min
         bound = better(bound, float(criterion.reported(phi)))
     unsure, reason = problem.uncertainty(indices), ""
-    off = float(getattr(problem.model, "resolution", 0.0))  # 0: exact derivatives
+    off = 0.0 if problem.model is None else problem.model.fitting.resolution
     if off > _ROUGH:
         unsure = min(2.0 * off, 1.0)
         reason = (

@@ -84,7 +84,7 @@ class _ModelBlocks(Blocks):
     ) -> None:
         assert offer.candidates is not None
         self._candidates, self._available = offer.candidates, offer.available
-        model = self._model = model.prepared(self.used)
+        model = self._model = model.fitting.prepared(self.used)
         self._centre = np.zeros(self._candidates.shape[1])
         if invariant and offer.prior is None and len(self.used):
             low, high = self.used.min(axis=0), self.used.max(axis=0)
@@ -106,7 +106,7 @@ class _ModelBlocks(Blocks):
         pairs = zip(model.names, resolved.free, strict=True)
         self.names = tuple(name for name, free in pairs if free)
         self._precision = resolved.precision[np.ix_(resolved.free, resolved.free)]
-        besides = model.facts(resolved.mean)[1][:, resolved.free]
+        besides = model.fitting.facts(resolved.mean)[1][:, resolved.free]
         self.root = prior_root(self._precision + besides.T @ besides)
 
     @property
@@ -191,8 +191,8 @@ def blocks_of(
         return Blocks(offer)
     if not of_parameters and shares_regressor(model, prior, offer.noise):
         return Blocks(offer)
-    if of_predictions and prior is None and model.misfit_std:
-        misfit = model.misfit_std
+    if of_predictions and prior is None and model.fitting.misfit_std:
+        misfit = model.fitting.misfit_std
         return _ModelBlocks(offer, model.with_misfit(), misfit, of_predictions)
     return _ModelBlocks(offer, model, 0.0, of_predictions or of_volume)
 
