@@ -66,6 +66,7 @@ class Table:
 
     head: Sequence[Content]
     rows: Sequence[Sequence[Content]]
+    caption: Content = ""
     numeric: bool = True  # all columns but the first are aligned to the right
 
     def __post_init__(self) -> None:

@@ -215,8 +215,9 @@ def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
         reasons.append(f"the nonlinear drift of the zero exceeds {limit}")
     if "prediction" not in summary and not summary.get("fit", {}).get("good", True):
         reasons += summary["fit"]["reasons"]  # of a model, by its readings alone
-    mispairing = summary.get("mispairing")
-    return [mispairing] * (bool(mispairing) and mispairing not in reasons) + reasons
+    if (mispairing := summary.get("mispairing")) and mispairing not in reasons:
+        reasons.insert(0, mispairing)
+    return reasons
 
 
 def drift_text(drift: dict[str, Any], outputs: Sequence[str], unit: str = "deg") -> str:
