@@ -232,17 +232,16 @@ def _noise(
     outputs: tuple[str, ...],
 ) -> tuple[Noise, bool]:
     """The noise as given, and whether that is at most a level of each output."""
-    num_outputs = len(outputs)
     if noise_std is not None:
         noise_std = of_frame("noise_std", noise_std, outputs, MEASURED)
     if noise is not None and not isinstance(noise, Noise):
         noise = as_noise(of_frame("noise", noise, outputs, MEASURED))
     if not (common_noise is None or isinstance(common_noise, bool)):
         labels = () if isinstance(common_noise, str) else np.atleast_1d(common_noise)
-        if np.shape(labels) != (num_outputs,):
+        if np.shape(labels) != (len(outputs),):
             raise ValueError(
                 f"common_noise must be True, False or a label for each of the "
-                f"{num_outputs} outputs, got {common_noise!r}"
+                f"{len(outputs)} outputs, got {common_noise!r}"
             )
     if noise is not None and noise_std is not None:
         raise ValueError("give noise_std or noise, not both")
@@ -252,7 +251,7 @@ def _noise(
     plain = plain and (noise.std is None or np.ndim(noise.std) < 2)
     level = noise_std if noise.std is None else noise.std
     if plain and level is not None:
-        noise = Noise(std=levels("noise_std", level, num_outputs))
+        noise = Noise(std=levels("noise_std", level, len(outputs)))
     estimated = noise.std is None and noise.covariance is None
     if common_noise is not None and not estimated:
         raise ValueError(
