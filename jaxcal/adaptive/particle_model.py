@@ -65,11 +65,6 @@ def systematic(log_weight: jax.Array, count: int, key: jax.Array) -> jax.Array:
     return jnp.minimum(index, len(log_weight) - 1).astype(jnp.int32)
 
 
-def log_mean(values: jax.Array) -> jax.Array:
-    """Log of the mean over the last axis of values that are given by their logs."""
-    return jax.nn.logsumexp(values, axis=-1) - jnp.log(float(values.shape[-1]))
-
-
 def gain_of(
     model: ParticleModel, unknowns: Any, design: Any, keys: jax.Array
 ) -> jax.Array:

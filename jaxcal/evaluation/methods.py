@@ -437,12 +437,3 @@ def least_squares(commands: Array, measured: Array) -> Array:
     biases = (mean_y - mean_u @ slopes)[..., 0, :]
     matrix = np.matrix_transpose(slopes)
     return np.concatenate([matrix.reshape(*biases.shape[:-1], -1), biases], axis=-1)
-
-
-def predict(parameters: Array, commands: Array) -> Array:
-    """(..., N, m) outputs at (..., N, n) commands, of the ``parameters`` (..., m (n +
-    1)) of ``least_squares``."""
-    n = commands.shape[-1]
-    m = parameters.shape[-1] // (n + 1)
-    matrix = parameters[..., : m * n].reshape(*parameters.shape[:-1], m, n)
-    return commands @ np.matrix_transpose(matrix) + parameters[..., None, m * n :]
