@@ -153,14 +153,10 @@ def compare(
     batch: int = 1024,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Comparison:
-    """Play every decider on the same ``episodes`` sessions.
+    """Play every decider on the same ``episodes`` sessions, at least two, of a seed.
 
-    Args:
-        task, deciders: what is played.
-        episodes: at least two.
-        seed: of the sessions.
-        batch: sessions played at once; the result does not depend on it.
-        progress: called with the sessions of a decider played so far, from 0.
+    ``batch`` of them are played at once; the result does not depend on it. ``progress``
+    is called with the sessions of a decider played so far, from 0.
     """
     keys = jax.random.split(jax.random.key(seed), episodes)
     measured = []

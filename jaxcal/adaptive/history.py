@@ -21,11 +21,8 @@ _NEAR = 1e-5  # of a coordinate's range: tolerance for coordinates of a design
 def begin(
     task: SequentialTask, seconds: float | None, uses: int | None, seed: int
 ) -> tuple[Any, Session]:
-    """The belief and the session at the start; a budget of None is the task's.
-
-    Raises:
-        ValueError: a budget is not given and the task draws it at random.
-    """
+    """The belief and the session at the start; a budget of None is the task's, and
+    refused where the task draws it at random."""
     belief, session = task.begin(jax.random.key(seed))
     if isinstance(task, GridTask):
         low, high = np.asarray(task.seconds)
@@ -59,13 +56,11 @@ def step_keys(seed: int, number: int) -> jax.Array:
 def checked_entry(
     loop: Any, design: Any, outcome: Any, where: str
 ) -> tuple[Any, jax.Array]:
-    """Design and outcome as the task has them, of a measurement that can be paid.
+    """Design and outcome as the task has them, of a measurement that can be paid; a
+    ValueError names the entry, the rule and the value.
 
     A task with a table ``designs`` (A, e) takes a whole number as an index of it and
     anything else as coordinates; other tasks take designs as their options have them.
-
-    Raises:
-        ValueError: naming the entry, the rule and the value.
     """
     table = getattr(loop.task, "designs", None)
     if table is not None:

@@ -152,11 +152,8 @@ class Loop:
             raise
 
     def follow(self, history: History) -> None:
-        """Take measurements that were made before, which no journal notes.
-
-        Raises:
-            ValueError: an entry that cannot be, by its number from 0.
-        """
+        """Take measurements that were made before, which no journal notes; a ValueError
+        names an entry that cannot be by its number from 0."""
         for number, entry in enumerate(history):
             where = f"history[{number}]"
             try:
@@ -210,13 +207,9 @@ class Loop:
         return Proposal(design, coordinates, *numbers, number, belief, session)
 
     def observed(self, outcome: Any, design: Any = None) -> None:
-        """Take an outcome: of what was suggested, or of another design that was made.
-
-        It is in the journal when this returns.
-
-        Raises:
-            ValueError: the session is over, or the design or the outcome cannot be.
-        """
+        """Take an outcome: of what was suggested, or of another design that was made;
+        it is in the journal when this returns. A ValueError says that the session is
+        over, or that the design or the outcome cannot be."""
         where = f"measurement {int(self.session.made)}"
         if design is None:
             design = self.suggest().design
@@ -250,12 +243,9 @@ def _default(task: SequentialTask, session: Session) -> Decider:
 
 
 def _opened(path: str | os.PathLike[str], header: Record) -> JsonLines:
-    """A journal: a header, which says what is measured and how, then measurements.
-
-    Raises:
-        ValueError: the file is of another task, decider or budget, damaged, or another
-            process is writing it.
-    """
+    """A journal: a header, which says what is measured and how, then measurements; a
+    ValueError where the file is of another task, decider or budget, damaged, or another
+    process is writing it."""
     header = {"kind": _KIND, "version": 1, **header}
 
     def whole(number: int, record: Record) -> bool:

@@ -48,13 +48,8 @@ class TaskPolicy:
 
 
 def exercise(config: PolicyConfig) -> Exercise:
-    """What ``make_train(config)`` is given.
-
-    Numbers are arrays, so that other constants do not compile again.
-
-    Raises:
-        ValueError: the registry or the task refuses its options.
-    """
+    """What ``make_train(config)`` is given; numbers are arrays, so that other constants
+    do not compile again. The registry or the task may refuse its options."""
     task = registry.load(config.task).make(**config.options)
     made: Exercise = jax.tree.map(jnp.asarray, Exercise(task, config.base))
     return made
@@ -70,20 +65,15 @@ def train(
     """Train until the budget is spent or ``should_stop`` says so, and save.
 
     It is validated on fresh sessions: ``nats`` of the averaged weights, and
-    ``nats_over_base`` in pairs.
+    ``nats_over_base`` in pairs. Refused are options of the task, and devices that
+    cannot share a minibatch evenly.
 
     Args:
         config: the run.
         folder: of the run; made where missing.
         num_devices: devices of each process; all when None.
         rest: ``resume``, ``report``, ``should_stop`` and ``num_updates`` of
-            ``training.run.run``.
-
-    Raises:
-        CheckpointError: nothing to resume from, or damaged.
-        ValueError: the registry or the task refuses its options, or the devices cannot
-            share a minibatch evenly.
-        OSError: the folder cannot be written.
+            ``training.run.run``, whose errors are raised too.
     """
     rows = config.ppo.rows_per_minibatch
     mesh = devices.make_mesh(rows, num_devices, config.num_seeds)
@@ -111,15 +101,9 @@ def train(
 
 
 def load(path: str | pathlib.Path | None = None) -> TaskPolicy:
-    """A policy; with several seeds the best by validation.
-
-    Args:
-        path: a weights file or a training run's folder; the policy of KNEE that ships
-            when None.
-
-    Raises:
-        CheckpointError: there is none, it is damaged, or it is of another kind.
-    """
+    """The policy in a weights file or a run's folder, with several seeds the best by
+    validation; that of KNEE which ships when None. A CheckpointError where there is
+    none, it is damaged, or it is of another kind."""
     path = weights.shipped("knee") if path is None else path
     source, meta = checkpoint.read_meta(path, SCHEMA)
     try:
