@@ -18,11 +18,18 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.arguments import refused, told, typed_line
 from jaxcal.checks import aligned
+from jaxcal.commands.train_configuration import (
+    TrainOptions,
+    fixed_validation,
+    of_postures,
+    of_task,
+    read,
+    teacher,
+)
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.learning.runtime import processes
 
 if TYPE_CHECKING:
-    from jaxcal.commands.train_arguments import TrainOptions
     from jaxcal.learning.training.presets import TrainConfig
     from jaxcal.learning.training.run import Report
 
@@ -43,8 +50,6 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
         processes.keep_compiled_programs()
         try:
             with needs("policy", "training"):
-                from jaxcal.commands.train_arguments import read
-
                 arguments = read(prog, words)
             with told():
                 return _run(arguments, prog)
@@ -64,8 +69,6 @@ def _run(arguments: TrainOptions, prog: str) -> int:
             arguments.task = _task_held(out)
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export takes a file NAME.npz, got {arguments.export}")
-    from jaxcal.commands.train_configuration import of_postures, of_task
-
     made_by = of_task if arguments.task else of_postures
     configure: Any = functools.partial(made_by, arguments, out)
     jax, config = sys.modules.get("jax"), None
@@ -135,7 +138,6 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
         schema, unit, columns = trainer.SCHEMA, "decisions", _TASK
         introduction = f"task {config.task}, seed {config.seed}; run folder {out}"
     else:
-        from jaxcal.commands.train_configuration import fixed_validation, teacher
         from jaxcal.learning.training import checkpoint
         from jaxcal.learning.training import postures as trainer
 
