@@ -119,10 +119,8 @@ def after(
     key: jax.Array,
 ) -> tuple[Any, Session]:
     """Belief and session after one measurement."""
-    return (
-        belief.update(task, design, outcome, key),
-        task.spend(session, design, outcome),
-    )
+    updated = belief.update(task, design, outcome, key)
+    return updated, task.spend(session, design, outcome)
 
 
 _can_answer = jit_by_class(ParticleBelief.can_answer)

@@ -62,7 +62,8 @@ def next_measurement(
     uses: int | None = None,
     seed: int = 0,
 ) -> Proposal:
-    """What to measure next, given what was measured.
+    """What to measure next, given what was measured; a ValueError names an entry of the
+    history that cannot be by its number.
 
     Args:
         task: what is unknown and what may be measured.
@@ -74,9 +75,6 @@ def next_measurement(
         seconds: budget of the whole session; the task's when not given.
         uses: budget of the countable resource; the task's when not given.
         seed: of random draws; the same arguments give the same proposal.
-
-    Raises:
-        ValueError: an entry of the history that cannot be, by its number.
     """
     with Loop(task, decider, seconds=seconds, uses=uses, seed=seed) as loop:
         loop.follow(history)

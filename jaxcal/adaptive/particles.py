@@ -228,7 +228,9 @@ class ParticleTask:
         contrasts: int = 100,
         moves: int = 3,
     ) -> ParticleTask:
-        """Check the numbers of a task.
+        """Check the numbers of a task; a ValueError names the argument, the rule and
+        the value, or what is wrong with the model: costs below 0, or probabilities that
+        do not sum to 1.
 
         Args:
             model: what is measured.
@@ -238,10 +240,6 @@ class ParticleTask:
             candidates: designs that are compared for every measurement.
             contrasts: particles that gains are computed from.
             moves: Metropolis steps each time that particles are resampled.
-
-        Raises:
-            ValueError: naming the argument, the rule and the value; a model whose costs
-                are below 0, or whose probabilities do not sum to 1.
         """
         budget = numbers("seconds", seconds, finite=False)
         if budget.ndim or not budget > 0.0:
@@ -285,10 +283,8 @@ class ParticleTask:
             candidates: (M, n) commands.
             measurements: of a session.
             cost: of a measurement: a number or (M,).
-            rest: ``seconds``, ``particles``, ``contrasts``, ``moves`` of ``make``.
-
-        Raises:
-            ValueError: naming the argument, the rule and the value.
+            rest: ``seconds``, ``particles``, ``contrasts``, ``moves`` of ``make``,
+                whose errors are raised too.
         """
         of_model = candidates_of(model, prior, noise, candidates, cost)
         count = len(of_model.commands)
