@@ -14,7 +14,7 @@ from jaxcal.adaptive.policy.config import PolicyConfig
 from jaxcal.adaptive.policy.network import Exercise, PolicyDecider, initial
 from jaxcal.adaptive.tasks import registry
 from jaxcal.learning.core.ppo import TrainState
-from jaxcal.learning.runtime import devices, weights
+from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import Weights
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.checkpoint import CheckpointError
@@ -55,28 +55,18 @@ def exercise(config: PolicyConfig) -> Exercise:
     return made
 
 
-def train(
-    config: PolicyConfig,
-    folder: str | pathlib.Path,
-    *,
-    num_devices: int | None = None,
-    **rest: Any,
-) -> TrainState:
+def train(config: PolicyConfig, folder: str | pathlib.Path, **rest: Any) -> TrainState:
     """Train until the budget is spent or ``should_stop`` says so, and save.
 
     It is validated on fresh sessions: ``nats`` of the averaged weights, and
-    ``nats_over_base`` in pairs. Refused are options of the task, and devices that
-    cannot share a minibatch evenly.
+    ``nats_over_base`` in pairs. The registry or the task may refuse its options.
 
     Args:
         config: the run.
         folder: of the run; made where missing.
-        num_devices: devices of each process; all when None.
-        rest: ``resume``, ``report``, ``should_stop`` and ``num_updates`` of
-            ``training.run.run``, whose errors are raised too.
+        rest: ``num_devices``, ``resume``, ``report``, ``should_stop`` and
+            ``num_updates`` of ``training.run.run``, whose errors are raised too.
     """
-    rows = config.ppo.rows_per_minibatch
-    mesh = devices.make_mesh(rows, num_devices, config.num_seeds)
     played = exercise(config)
     keys = jax.random.split(jax.random.key(_FRESH), _VALIDATED)
     task, base = played.task, played.base
@@ -91,13 +81,13 @@ def train(
 
     recipe = Recipe(
         config=config,
-        given=(devices.replicate(played, mesh),),
+        given=(played,),
         schema=SCHEMA,
         columns=("choices",),
         measured=MEASURED,
         validate=validate,
     )
-    return run(recipe, folder, mesh=mesh, **rest)
+    return run(recipe, folder, **rest)
 
 
 def load(path: str | pathlib.Path | None = None) -> TaskPolicy:
