@@ -335,11 +335,9 @@ def _of_cells(values: Array, weights: Array, tails: tuple[float, float]) -> Esti
     cells, cell = np.unique(values, return_inverse=True)
     mass = np.bincount(cell, weights=weights) / weights.sum()
     middle = (cells[1:] + cells[:-1]) / 2.0
-    first, last = (
-        (2.0 * cells[0] - middle[0], 2.0 * cells[-1] - middle[-1])
-        if len(cells) > 1
-        else (cells[0], cells[0])
-    )
+    first, last = cells[0], cells[-1]
+    if len(cells) > 1:
+        first, last = 2.0 * first - middle[0], 2.0 * last - middle[-1]
     edges = np.concatenate([[first], middle, [last]])
     below = np.concatenate([[0.0], np.cumsum(mass)])
     # Quantiles of the piecewise linear distribution function.

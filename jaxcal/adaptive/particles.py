@@ -300,9 +300,8 @@ class ParticleTask:
         """Sessions that are played at once, for the memory that their gains take."""
         support = self.model.support
         wide = self.num_contrasts if support is None else len(support)
-        return max(
-            1, min(256, _AT_ONCE // (self.num_candidates * self.num_contrasts * wide))
-        )
+        size = self.num_candidates * self.num_contrasts * wide
+        return max(1, min(256, _AT_ONCE // size))
 
     def draw(self, key: jax.Array) -> jax.Array:
         """(d,) coordinates of the truth."""

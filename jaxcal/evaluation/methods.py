@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from jaxcal import selection
-from jaxcal.checks import Array, one_of, whole_number
+from jaxcal.checks import Array, Indices, one_of, whole_number
 from jaxcal.deadline import Deadline
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.report import (
@@ -31,7 +31,6 @@ from jaxcal.information.regression import log_det_gram
 from jaxcal.models.linear import Affine
 from jaxcal.selection.problem import make_problems
 
-Indices = NDArray[np.int64]
 T = TypeVar("T")
 Progress = Callable[[str, int, int], None]
 """label, selections done, selections in all"""
