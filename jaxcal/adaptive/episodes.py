@@ -93,8 +93,7 @@ def _played(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes
 
         def going(carry: Any) -> tuple[Any, Any]:
             belief, session = carry
-            result: tuple[Any, Any] = jax.vmap(choose)(truth, belief, session, keys)
-            return result
+            return jax.vmap(choose)(truth, belief, session, keys)
 
         blank = jax.eval_shape(going, carry)[1]
         # Nothing is computed once every session is over.

@@ -91,8 +91,7 @@ class ParticleBelief:
 
         if len(options.seconds) <= _DESIGNS:
             return jax.vmap(gain)(options.designs)
-        of_all: jax.Array = jax.lax.map(gain, options.designs, batch_size=_DESIGNS)
-        return of_all
+        return jax.lax.map(gain, options.designs, batch_size=_DESIGNS)
 
     def gain(self, task: ParticleTask, design: Any, key: jax.Array) -> jax.Array:
         """() nats of one design: ``gains`` of it alone, by draws of its own."""

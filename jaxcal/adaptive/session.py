@@ -77,17 +77,12 @@ def on_host(
     deadlocks, because the pool's only thread is the one waiting for the copy.
     """
     if jax.default_backend() != "cpu":  # memory that numpy cannot read
-        copied: jax.Array = jax.pure_callback(
-            function, result, *arrays, vmap_method="expand_dims"
-        )
-        return copied
+        return jax.pure_callback(function, result, *arrays, vmap_method="expand_dims")
 
     def call(context: Any, out: Any, *buffers: Any) -> None:
         np.asarray(out)[...] = function(*map(np.asarray, buffers))
 
-    call_host = buffer_callback(call, result, vmap_method="expand_dims")
-    answer: jax.Array = call_host(*arrays)
-    return answer
+    return buffer_callback(call, result, vmap_method="expand_dims")(*arrays)
 
 
 @struct.dataclass

@@ -148,9 +148,7 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
         more = {"validation": None, "teacher": teacher}
     if first:
         print(f"{introduction}\nconfiguration:")
-        print(
-            pprint.pformat(config.as_meta(), width=88, compact=True, sort_dicts=False)
-        )
+        pprint.pp(config.as_meta(), width=88, compact=True)
         if validates:
             more["validation"] = fixed_validation(config)
         reward, *measured = columns

@@ -51,8 +51,7 @@ def exercise(config: PolicyConfig) -> Exercise:
     """What ``make_train(config)`` is given; numbers are arrays, so that other constants
     do not compile again. The registry or the task may refuse its options."""
     task = registry.load(config.task).make(**config.options)
-    made: Exercise = jax.tree.map(jnp.asarray, Exercise(task, config.base))
-    return made
+    return jax.tree.map(jnp.asarray, Exercise(task, config.base))
 
 
 def train(config: PolicyConfig, folder: str | pathlib.Path, **rest: Any) -> TrainState:
