@@ -16,7 +16,7 @@ from jaxcal.arguments import Parser, typed_line, values_of
 from jaxcal.commands.tables import holds_sets, read_pool
 from jaxcal.extras import needs
 from jaxcal.files import require_writable_folder
-from jaxcal.learning.config import Setting, StreamsConfig, settings_of
+from jaxcal.learning.config import StreamsConfig, settings_of
 from jaxcal.learning.environments.task import GivenCandidates
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.training import presets
@@ -105,24 +105,21 @@ def flag_of(name: str) -> str:
     return "--" + _NAMES.get(name, name).rstrip("_").replace("_", "-")
 
 
-def _held(name: str) -> Any:
-    """The value of compact, or of tasks."""
-    config = presets.load("compact")
-    parts = (config, config.ppo, config.network, config.tasks[0].environment, PPO)
-    return next(
-        getattr(part, name)
-        for part in (*parts, PolicyConfig)
-        if name in part.__dataclass_fields__
-    )
+def _settings(*parts: Any) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
+    """By name: the fields of configurations that a command shows, and their values."""
+    return {
+        f.name: (f, getattr(part, f.name)) for part in parts for f in settings_of(part)
+    }
 
 
-def _flags(title: str, settings: Iterable[Setting]) -> type:
+def _flags(title: str, settings: Iterable[tuple[dataclasses.Field[Any], Any]]) -> type:
     """A dataclass of settings, None where one is not given, as ``Parser.of`` reads."""
-    shown = {int: "N", float: "X", str: "NAME", bool: ""}
+    shown = {"int": (int, "N"), "float": (float, "X"), "str": (str, "NAME")}
     fields = []
-    for field in settings:
-        kind: Any = field.kind | None
-        said = Annotated[kind, f"{field.help} [{_held(field.name)}]", shown[field.kind]]
+    for field, value in settings:
+        single, metavar = shown.get(str(field.type), (bool, ""))
+        kind: Any = single | None
+        said = Annotated[kind, f"{field.metadata['help']} [{value}]", metavar]
         default = dataclasses.field(default=None)
         fields.append((_NAMES.get(field.name, field.name), said, default))
     about = "in brackets: the value of compact"
@@ -132,8 +129,9 @@ def _flags(title: str, settings: Iterable[Setting]) -> type:
     )
 
 
-_POSTURES = {f.name: f for part in presets.PARTS.values() for f in settings_of(part)}
-_TASKS = {f.name: f for part in TASK_PARTS for f in settings_of(part)}
+_RUN = presets.load("compact")
+_POSTURES = _settings(_RUN, _RUN.ppo, _RUN.network, _RUN.tasks[0].environment)
+_TASKS = _settings(PPO, PolicyConfig)
 _ONE = [field for name, field in _POSTURES.items() if name not in _TASKS]
 _OTHER = [field for name, field in _TASKS.items() if name not in _POSTURES]
 _BOTH = [field for name, field in _POSTURES.items() if name in _TASKS]
