@@ -71,12 +71,12 @@ def train(config: PolicyConfig, folder: str | pathlib.Path, **rest: Any) -> Trai
     task, base = played.task, played.base
     rules: list[float] = []  # nats of the base rule, once it is played
 
-    def validate(average: Any) -> dict[str, float]:
+    def validate(average: Any) -> tuple[float, float]:
         policy = PolicyDecider(average, base, config.per_group, config.width)
         if not rules:
             rules.append(float(play(task, base, keys).gain.mean()))
         nats = float(play(task, policy, keys).gain.mean())
-        return dict(zip(MEASURED, (nats, nats - rules[0]), strict=True))
+        return nats, nats - rules[0]
 
     recipe = Recipe(
         config=config,

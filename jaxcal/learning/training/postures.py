@@ -200,10 +200,8 @@ class Validation:
         gap = np.asarray(scorer.log_det_of(candidates, indices)) - self.best
         # float32 values against a float64 optimum: equal to a few units in the last
         # place counts as hit; evaluate.py compares in float64.
-        return (
-            float(np.exp(self.num_outputs * np.minimum(gap, 0.0)).mean()),
-            float((gap > -2e-5).mean()),
-        )
+        ratio = np.exp(self.num_outputs * np.minimum(gap, 0.0))
+        return float(ratio.mean()), float((gap > -2e-5).mean())
 
 
 def train(
@@ -254,18 +252,16 @@ def train(
         imitation = Imitation(learner.config, learner.task, learner.network)
         return imitation, lessons.at(index)
 
-    def validate(average: Any) -> dict[str, float]:
-        assert validation is not None  # else it is not called
-        measured = validation.measure(network, average, k)
-        return dict(zip(MEASURED, measured, strict=True))
-
+    validate = None
+    if validation is not None:
+        validate = functools.partial(validation.measure, network, k=k)
     recipe = Recipe(
         config=config,
         given=(),
         schema=checkpoint.SCHEMA,
         columns=("reward_std", "log_det_mean"),
         measured=MEASURED,
-        validate=None if validation is None else validate,
+        validate=validate,
         num_imitated=imitated,
         imitate=imitate,
     )

@@ -54,7 +54,7 @@ class Recipe:
     schema: str  # of the checkpoints
     columns: tuple[str, ...]  # further ones of metrics.csv, in every update
     measured: tuple[str, ...]  # columns of validations; the first ranks the seeds
-    validate: Callable[[Any], dict[str, float]] | None  # averaged weights -> measured
+    validate: Callable[[Any], tuple[float, ...]] | None  # averaged weights -> measured
     # The first updates imitate: their number; update -> its learner and argument.
     num_imitated: int = 0
     imitate: Callable[[int], tuple[Learner, Any]] | None = None
@@ -337,7 +337,10 @@ class _Recorder:
                 policies = [
                     jax.tree.map(lambda x, i=i: x[i], average) for i in range(number)
                 ]
-            self._of_seeds = [recipe.validate(policy) for policy in policies]
+            self._of_seeds = [
+                dict(zip(recipe.measured, recipe.validate(policy), strict=True))
+                for policy in policies
+            ]
             for name in self._of_seeds[0]:
                 values = [seed[name] for seed in self._of_seeds]
                 row[name] = float(np.mean(values))
