@@ -62,8 +62,8 @@ def next_measurement(
     uses: int | None = None,
     seed: int = 0,
 ) -> Proposal:
-    """What to measure next, given what was measured; a ValueError names an entry of the
-    history that cannot be by its number.
+    """What to measure next, given what was measured; a ValueError names, by its number,
+    an entry of the history that cannot be.
 
     Args:
         task: what is unknown and what may be measured.
@@ -151,7 +151,7 @@ class Loop:
 
     def follow(self, history: History) -> None:
         """Take measurements that were made before, which no journal notes; a ValueError
-        names an entry that cannot be by its number from 0."""
+        names, by its number from 0, an entry that cannot be."""
         for number, entry in enumerate(history):
             where = f"history[{number}]"
             try:
