@@ -131,11 +131,10 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
     trainer: Any
     more: dict[str, Any] = {}
     first = devices.is_first()
-    validates = first and not (arguments.task or arguments.no_validation)
     if arguments.task:
         from jaxcal.adaptive.policy import training as trainer
 
-        schema, unit, columns = trainer.SCHEMA, "decisions", _TASK
+        schema, columns = trainer.SCHEMA, _TASK
         introduction = f"task {config.task}, seed {config.seed}; run folder {out}"
     else:
         from jaxcal.learning.training import checkpoint
@@ -143,20 +142,20 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
 
         rows = config.ppo.rows_per_minibatch
         mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
-        schema, unit, columns = checkpoint.SCHEMA, "episodes", _POSTURES
+        schema, columns = checkpoint.SCHEMA, _POSTURES
         introduction = _introduction(config, out, devices.describe(mesh))
-        more = {"validation": None, "teacher": teacher}
+        more = {"teacher": teacher}
     if first:
         print(f"{introduction}\nconfiguration:")
         pprint.pp(config.as_meta(), width=88, compact=True)
-        if validates:
+        if not (arguments.task or arguments.no_validation):
             more["validation"] = fixed_validation(config)
         reward, *measured = columns
         heads = f"{reward:>8} " + " ".join(f"{name:>16}" for name in measured)
         print(
             "compiling the training step (some 15 s; a few seconds where this "
             "machine has compiled it before) ...\n"
-            f"   update {unit:>10}     /s   elapsed      left {heads}",
+            f"   update {config.ppo.unit:>10}     /s   elapsed      left {heads}",
             flush=True,
         )
     state = trainer.train(
