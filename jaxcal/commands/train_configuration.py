@@ -114,12 +114,13 @@ def _settings(*parts: Any) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
 
 def _flags(title: str, settings: Iterable[tuple[dataclasses.Field[Any], Any]]) -> type:
     """A dataclass of settings, None where one is not given, as ``Parser.of`` reads."""
-    shown = {"int": (int, "N"), "float": (float, "X"), "str": (str, "NAME")}
+    shown: dict[Any, str] = {int: "N", float: "X", str: "NAME", bool: ""}
+    kinds = {kind.__name__: kind for kind in shown}
     fields = []
     for field, value in settings:
-        single, metavar = shown.get(str(field.type), (bool, ""))
+        single = kinds[str(field.type)]
         kind: Any = single | None
-        said = Annotated[kind, f"{field.metadata['help']} [{value}]", metavar]
+        said = Annotated[kind, f"{field.metadata['help']} [{value}]", shown[single]]
         default = dataclasses.field(default=None)
         fields.append((_NAMES.get(field.name, field.name), said, default))
     about = "in brackets: the value of compact"
