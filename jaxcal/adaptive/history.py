@@ -46,10 +46,8 @@ def begin(
 
 def step_keys(seed: int, number: int) -> jax.Array:
     """(4,) keys of measurement ``number``, from 0: of its options, the choice, the
-    belief's update, and the gain that is told, which no choice was made by.
-
-    They depend on seed and number alone: a resumed session goes on as uninterrupted.
-    """
+    belief's update, and the gain that is told, which no choice was made by. They depend
+    on seed and number alone: a resumed session goes on as uninterrupted."""
     return jax.random.split(jax.random.fold_in(jax.random.key(seed), number), 4)
 
 

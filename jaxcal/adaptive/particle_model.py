@@ -43,10 +43,8 @@ class ParticleModel(Protocol):
     def propose(
         self, unknowns: Any, session: Session, key: jax.Array, count: int
     ) -> Any:
-        """``count`` candidate designs, given draws of the unknowns, leaves (N, ...).
-
-        At least one must cost at most ``session.seconds``; others are not chosen.
-        """
+        """``count`` candidate designs, given draws of the unknowns, leaves (N, ...); at
+        least one must cost at most ``session.seconds``, others are not chosen."""
 
     def cost(self, session: Session, design: Any) -> jax.Array:
         """() cost of a design, in the unit of ``session.seconds``."""

@@ -104,10 +104,8 @@ class Rule(abc.ABC):
     def price(
         self, task: Any, session: Session, options: Options, *expected: jax.Array
     ) -> jax.Array:
-        """(A,) what the measurements are taken to cost.
-
-        ``expected``: their gains, seconds and uses, (A,) each.
-        """
+        """(A,) what the measurements are taken to cost; ``expected``: their gains,
+        seconds and uses, (A,) each."""
 
     def judged(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
