@@ -45,11 +45,7 @@ from jaxcal.learning.environments import selection
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import scorer
 from jaxcal.learning.policies.compact import CompactNetwork
-from jaxcal.learning.policies.features import (
-    AHEAD,
-    CandidateFeatures,
-    DecisionFeatures,
-)
+from jaxcal.learning.policies.features import CandidateFeatures, DecisionFeatures
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.training import postures as training
@@ -59,6 +55,7 @@ from jaxcal.selection.policy import select_batch
 
 HIT = 1e-9
 PARTS = ("unlearned", "shipped", "tasks", "time", "trained")
+AHEAD = ("gain", "best pair", "greedy triple", "greedy to the end")  # the look-ahead's
 CHUNK = 250  # sets a compiled call of a rule without learning
 CELLS = 2_000_000  # pairs of candidates scored at once
 STARTS = 16  # of exchange

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.adaptive.episodes import Episodes
-from jaxcal.adaptive.particle_model import log_mean
 from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
 from jaxcal.adaptive.session import jit_by_class
 from jaxcal.checks import whole_number
@@ -176,8 +175,8 @@ def _sace(
 
         own = observed._history(episode.truth[None])[0]
         truth, others = joint(episode.truth[None])[0], joint(z)
-        lower = own - log_mean(jnp.append(others, truth))
-        return lower, own - log_mean(others)
+        lower = own - _log_mean(jnp.append(others, truth))
+        return lower, own - _log_mean(others)
 
     keys = jax.random.split(key, len(episodes.truth))
     return jax.lax.map(one, (episodes, keys))
@@ -227,8 +226,13 @@ def _log_proposal(z: jax.Array, centres: jax.Array, roots: jax.Array) -> jax.Arr
     apart = z[:, None] - centres[None]
     normal = jnp.einsum("mij,lmj->lmi", inverse, apart)
     log_det = jnp.log(jnp.abs(jnp.einsum("mii->mi", roots))).sum(axis=-1)
-    kernels = log_mean(-0.5 * (normal * normal).sum(axis=-1) - log_det[None])
+    kernels = _log_mean(-0.5 * (normal * normal).sum(axis=-1) - log_det[None])
     prior = -0.5 * (z * z).sum(axis=-1)
     return jnp.logaddexp(
         kernels + jnp.log1p(-_PRIOR), prior + jnp.log(jnp.asarray(_PRIOR))
     )
+
+
+def _log_mean(values: jax.Array) -> jax.Array:
+    """Log of the mean over the last axis of values that are given by their logs."""
+    return jax.nn.logsumexp(values, axis=-1) - jnp.log(float(values.shape[-1]))

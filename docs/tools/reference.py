@@ -122,7 +122,8 @@ def _presets() -> str:
         "|---" * (2 + len(known)) + "|",
     ]
     for part, kind in presets.PARTS.items():
-        for name, _, text in settings_of(kind):
+        for field in settings_of(kind):
+            name, text = field.name, field.metadata["help"]
             cells = []
             for config in known.values():
                 parts = [getattr(config, part, config)]  # "run" is the whole

@@ -37,13 +37,10 @@ class TaskEnv(FunctionalEnv):
 
     Args:
         task: a ``GridTask`` or a ``ParticleTask``.
-        base: the rule that ranks the options and that the network corrects; the
-            default's constants serve any task, ``tuning.tune(task, StateRule())`` makes
-            those of one.
+        base: the rule with a price that ranks the options and that the network
+            corrects; the default's constants serve any task, ``tuning.tune(task,
+            StateRule())`` makes those of one.
         per_group: options of each of the task's groups in the shortlist.
-
-    Raises:
-        ValueError: the rule has no price.
     """
 
     metric = "gain"

@@ -55,22 +55,18 @@ def play(
         parts.append(_played(task, decider, padded[at : at + size]))
     if len(parts) == 1:
         return parts[0]
-    whole: Episodes = jax.tree.map(
-        lambda *leaves: jnp.concatenate(leaves)[:count], *parts
-    )
-    return whole
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *parts)
 
 
 @jit_by_class
 def _played(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes:
-    key_truth, key_begin, key_steps = jax.vmap(
-        lambda key: jax.random.split(key, 3), out_axes=1
-    )(keys)
+    def split(keys: jax.Array, number: int) -> jax.Array:
+        return jax.vmap(lambda key: jax.random.split(key, number), out_axes=1)(keys)
+
+    key_truth, key_begin, key_steps = split(keys, 3)
     truth = jax.vmap(task.draw)(key_truth)
     prior, begun = jax.vmap(task.begin)(key_begin)
-    steps = jax.vmap(lambda key: jax.random.split(key, task.horizon), out_axes=1)(
-        key_steps
-    )
+    steps = split(key_steps, task.horizon)
 
     def choose(truth: Any, belief: Any, session: Any, key: jax.Array) -> Any:
         key_options, key_choice, key_gain, key_outcome, key_update = jax.random.split(
@@ -81,10 +77,8 @@ def _played(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes
         design = jax.tree.map(lambda leaf: leaf[index], options.designs)
         gain = belief.gain(task, design, key_gain)
         outcome = task.measure(truth, design, key_outcome)
-        after = (
-            belief.update(task, design, outcome, key_update),
-            task.spend(session, design, outcome),
-        )
+        updated = belief.update(task, design, outcome, key_update)
+        after = updated, task.spend(session, design, outcome)
         alive = ~task.over(session) & options.allowed.any()
         after = jax.tree.map(
             lambda old, new: jnp.where(alive, new, old), (belief, session), after
@@ -99,8 +93,7 @@ def _played(task: SequentialTask, decider: Decider, keys: jax.Array) -> Episodes
 
         def going(carry: Any) -> tuple[Any, Any]:
             belief, session = carry
-            result: tuple[Any, Any] = jax.vmap(choose)(truth, belief, session, keys)
-            return result
+            return jax.vmap(choose)(truth, belief, session, keys)
 
         blank = jax.eval_shape(going, carry)[1]
         # Nothing is computed once every session is over.
@@ -153,14 +146,10 @@ def compare(
     batch: int = 1024,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Comparison:
-    """Play every decider on the same ``episodes`` sessions.
+    """Play every decider on the same ``episodes`` sessions, at least two, of a seed.
 
-    Args:
-        task, deciders: what is played.
-        episodes: at least two.
-        seed: of the sessions.
-        batch: sessions played at once; the result does not depend on it.
-        progress: called with the sessions of a decider played so far, from 0.
+    ``batch`` of them are played at once; the result does not depend on it. ``progress``
+    is called with the sessions of a decider played so far, from 0.
     """
     keys = jax.random.split(jax.random.key(seed), episodes)
     measured = []

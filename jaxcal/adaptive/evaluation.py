@@ -150,20 +150,13 @@ def evaluate(
     retune: bool = False,
     progress: Progress = lambda what, done, of: None,
 ) -> DeciderEvaluation:
-    """Play every method on the same sessions.
+    """Play every method, of ``METHODS``, on the same sessions of a seed; refused are
+    another method, options that the task does not take, and a policy that is missing.
 
     Args:
         name, entry, options: the task, its entry and options of ``entry.make``.
-        methods: of ``METHODS``.
         checkpoint: of the policy; the one that ships when None.
-        episodes: sessions.
-        seed: of the sessions.
         retune: tune the rules on this task instead of taking the constants that ship.
-        progress: told what is done.
-
-    Raises:
-        ValueError: an unknown method, or options that the task refuses.
-        CheckpointError: there is no such policy.
     """
     for method in methods:
         if method not in METHODS:

@@ -44,13 +44,11 @@ def fit(
     uses: int | None = None,
     seed: int = 0,
 ) -> Ahead | Shares:
-    """``ahead`` with the constants that gain most on a task's own sessions, or
-    ``SHARES`` where the tree loses against it.
+    """``ahead`` with the constants that gain most on a task's own sessions, every
+    design allowed, or ``SHARES`` where the tree loses against it.
 
-    Args:
-        task: what is measured; every design allowed.
-        seconds, uses: budget of its sessions; the task's when not given.
-        seed: of the simulation; the same arguments give the same constants.
+    ``seconds`` and ``uses`` are the budget of the sessions, the task's when None. The
+    same arguments give the same constants.
     """
     task = jax.device_get(task)
     budget = np.asarray(task.seconds if seconds is None else (seconds, seconds))

@@ -160,7 +160,7 @@ class GridTask:
         overrun: bool = False,
         theta_names: Sequence[str] = (),
     ) -> GridTask:
-        """Check the tables of a task.
+        """Check the tables of a task; a ValueError names the table, rule and value.
 
         Args:
             theta: (S, d) or (S,) values that the unknown may have.
@@ -182,9 +182,6 @@ class GridTask:
             overrun: True: a measurement may begin while any time and uses are left. By
                 default none that could exceed what is left; a session in which all
                 could is over.
-
-        Raises:
-            ValueError: naming the table, the rule and the value.
         """
         at, grid = checked.columns("designs", designs), checked.columns("theta", theta)
         table = checked.probabilities(likelihood, at, grid)

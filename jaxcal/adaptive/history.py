@@ -21,11 +21,8 @@ _NEAR = 1e-5  # of a coordinate's range: tolerance for coordinates of a design
 def begin(
     task: SequentialTask, seconds: float | None, uses: int | None, seed: int
 ) -> tuple[Any, Session]:
-    """The belief and the session at the start; a budget of None is the task's.
-
-    Raises:
-        ValueError: a budget is not given and the task draws it at random.
-    """
+    """The belief and the session at the start; a budget of None is the task's, and
+    refused where the task draws it at random."""
     belief, session = task.begin(jax.random.key(seed))
     if isinstance(task, GridTask):
         low, high = np.asarray(task.seconds)
@@ -49,23 +46,19 @@ def begin(
 
 def step_keys(seed: int, number: int) -> jax.Array:
     """(4,) keys of measurement ``number``, from 0: of its options, the choice, the
-    belief's update, and the gain that is told, which no choice was made by.
-
-    They depend on seed and number alone: a resumed session goes on as uninterrupted.
-    """
+    belief's update, and the gain that is told, which no choice was made by. They depend
+    on seed and number alone: a resumed session goes on as uninterrupted."""
     return jax.random.split(jax.random.fold_in(jax.random.key(seed), number), 4)
 
 
 def checked_entry(
     loop: Any, design: Any, outcome: Any, where: str
 ) -> tuple[Any, jax.Array]:
-    """Design and outcome as the task has them, of a measurement that can be paid.
+    """Design and outcome as the task has them, of a measurement that can be paid; a
+    ValueError names the entry, the rule and the value.
 
     A task with a table ``designs`` (A, e) takes a whole number as an index of it and
     anything else as coordinates; other tasks take designs as their options have them.
-
-    Raises:
-        ValueError: naming the entry, the rule and the value.
     """
     table = getattr(loop.task, "designs", None)
     if table is not None:
@@ -124,10 +117,8 @@ def after(
     key: jax.Array,
 ) -> tuple[Any, Session]:
     """Belief and session after one measurement."""
-    return (
-        belief.update(task, design, outcome, key),
-        task.spend(session, design, outcome),
-    )
+    updated = belief.update(task, design, outcome, key)
+    return updated, task.spend(session, design, outcome)
 
 
 _can_answer = jit_by_class(ParticleBelief.can_answer)

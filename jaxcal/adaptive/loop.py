@@ -62,7 +62,8 @@ def next_measurement(
     uses: int | None = None,
     seed: int = 0,
 ) -> Proposal:
-    """What to measure next, given what was measured.
+    """What to measure next, given what was measured; a ValueError names, by its number,
+    an entry of the history that cannot be.
 
     Args:
         task: what is unknown and what may be measured.
@@ -74,9 +75,6 @@ def next_measurement(
         seconds: budget of the whole session; the task's when not given.
         uses: budget of the countable resource; the task's when not given.
         seed: of random draws; the same arguments give the same proposal.
-
-    Raises:
-        ValueError: an entry of the history that cannot be, by its number.
     """
     with Loop(task, decider, seconds=seconds, uses=uses, seed=seed) as loop:
         loop.follow(history)
@@ -152,11 +150,8 @@ class Loop:
             raise
 
     def follow(self, history: History) -> None:
-        """Take measurements that were made before, which no journal notes.
-
-        Raises:
-            ValueError: an entry that cannot be, by its number from 0.
-        """
+        """Take measurements that were made before, which no journal notes; a ValueError
+        names, by its number from 0, an entry that cannot be."""
         for number, entry in enumerate(history):
             where = f"history[{number}]"
             try:
@@ -210,13 +205,9 @@ class Loop:
         return Proposal(design, coordinates, *numbers, number, belief, session)
 
     def observed(self, outcome: Any, design: Any = None) -> None:
-        """Take an outcome: of what was suggested, or of another design that was made.
-
-        It is in the journal when this returns.
-
-        Raises:
-            ValueError: the session is over, or the design or the outcome cannot be.
-        """
+        """Take an outcome: of what was suggested, or of another design that was made;
+        it is in the journal when this returns. A ValueError says that the session is
+        over, or that the design or the outcome cannot be."""
         where = f"measurement {int(self.session.made)}"
         if design is None:
             design = self.suggest().design
@@ -250,12 +241,9 @@ def _default(task: SequentialTask, session: Session) -> Decider:
 
 
 def _opened(path: str | os.PathLike[str], header: Record) -> JsonLines:
-    """A journal: a header, which says what is measured and how, then measurements.
-
-    Raises:
-        ValueError: the file is of another task, decider or budget, damaged, or another
-            process is writing it.
-    """
+    """A journal: a header, which says what is measured and how, then measurements; a
+    ValueError where the file is of another task, decider or budget, damaged, or another
+    process is writing it."""
     header = {"kind": _KIND, "version": 1, **header}
 
     def whole(number: int, record: Record) -> bool:
@@ -347,11 +335,9 @@ def _of_cells(values: Array, weights: Array, tails: tuple[float, float]) -> Esti
     cells, cell = np.unique(values, return_inverse=True)
     mass = np.bincount(cell, weights=weights) / weights.sum()
     middle = (cells[1:] + cells[:-1]) / 2.0
-    first, last = (
-        (2.0 * cells[0] - middle[0], 2.0 * cells[-1] - middle[-1])
-        if len(cells) > 1
-        else (cells[0], cells[0])
-    )
+    first, last = cells[0], cells[-1]
+    if len(cells) > 1:
+        first, last = 2.0 * first - middle[0], 2.0 * last - middle[-1]
     edges = np.concatenate([[first], middle, [last]])
     below = np.concatenate([[0.0], np.cumsum(mass)])
     # Quantiles of the piecewise linear distribution function.

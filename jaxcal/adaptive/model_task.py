@@ -109,12 +109,9 @@ def candidates_of(
     candidates: ArrayLike,
     seconds: ArrayLike,
 ) -> Candidates:
-    """``model`` at its candidates, with arrays in float32.
-
-    Raises:
-        ValueError: a prior or noise that is not given where the model has none of its
-            own, or of which nothing can be drawn; candidates or costs that are wrong.
-    """
+    """``model`` at its candidates, with arrays in float32; refused are a prior or noise
+    that is not given where the model has none of its own, or of which nothing can be
+    drawn, and candidates or costs that are wrong."""
     model = as_model(model)
     if isinstance(model, FromJax | FromFunction):  # which count inputs by the first
         model.predict(table("candidates", by_name(model, candidates))[:1])

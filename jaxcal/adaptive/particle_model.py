@@ -43,10 +43,8 @@ class ParticleModel(Protocol):
     def propose(
         self, unknowns: Any, session: Session, key: jax.Array, count: int
     ) -> Any:
-        """``count`` candidate designs, given draws of the unknowns, leaves (N, ...).
-
-        At least one must cost at most ``session.seconds``; others are not chosen.
-        """
+        """``count`` candidate designs, given draws of the unknowns, leaves (N, ...); at
+        least one must cost at most ``session.seconds``, others are not chosen."""
 
     def cost(self, session: Session, design: Any) -> jax.Array:
         """() cost of a design, in the unit of ``session.seconds``."""
@@ -63,11 +61,6 @@ def systematic(log_weight: jax.Array, count: int, key: jax.Array) -> jax.Array:
     ticks = (jnp.arange(count) + jax.random.uniform(key)) / count * below[-1]
     index = jnp.searchsorted(below, ticks, side="right")
     return jnp.minimum(index, len(log_weight) - 1).astype(jnp.int32)
-
-
-def log_mean(values: jax.Array) -> jax.Array:
-    """Log of the mean over the last axis of values that are given by their logs."""
-    return jax.nn.logsumexp(values, axis=-1) - jnp.log(float(values.shape[-1]))
 
 
 def gain_of(

@@ -91,8 +91,7 @@ class ParticleBelief:
 
         if len(options.seconds) <= _DESIGNS:
             return jax.vmap(gain)(options.designs)
-        of_all: jax.Array = jax.lax.map(gain, options.designs, batch_size=_DESIGNS)
-        return of_all
+        return jax.lax.map(gain, options.designs, batch_size=_DESIGNS)
 
     def gain(self, task: ParticleTask, design: Any, key: jax.Array) -> jax.Array:
         """() nats of one design: ``gains`` of it alone, by draws of its own."""
@@ -228,7 +227,9 @@ class ParticleTask:
         contrasts: int = 100,
         moves: int = 3,
     ) -> ParticleTask:
-        """Check the numbers of a task.
+        """Check the numbers of a task; a ValueError names the argument, the rule and
+        the value, or what is wrong with the model: costs below 0, or probabilities that
+        do not sum to 1.
 
         Args:
             model: what is measured.
@@ -238,10 +239,6 @@ class ParticleTask:
             candidates: designs that are compared for every measurement.
             contrasts: particles that gains are computed from.
             moves: Metropolis steps each time that particles are resampled.
-
-        Raises:
-            ValueError: naming the argument, the rule and the value; a model whose costs
-                are below 0, or whose probabilities do not sum to 1.
         """
         budget = numbers("seconds", seconds, finite=False)
         if budget.ndim or not budget > 0.0:
@@ -285,10 +282,8 @@ class ParticleTask:
             candidates: (M, n) commands.
             measurements: of a session.
             cost: of a measurement: a number or (M,).
-            rest: ``seconds``, ``particles``, ``contrasts``, ``moves`` of ``make``.
-
-        Raises:
-            ValueError: naming the argument, the rule and the value.
+            rest: ``seconds``, ``particles``, ``contrasts``, ``moves`` of ``make``,
+                whose errors are raised too.
         """
         of_model = candidates_of(model, prior, noise, candidates, cost)
         count = len(of_model.commands)
@@ -304,9 +299,8 @@ class ParticleTask:
         """Sessions that are played at once, for the memory that their gains take."""
         support = self.model.support
         wide = self.num_contrasts if support is None else len(support)
-        return max(
-            1, min(256, _AT_ONCE // (self.num_candidates * self.num_contrasts * wide))
-        )
+        size = self.num_candidates * self.num_contrasts * wide
+        return max(1, min(256, _AT_ONCE // size))
 
     def draw(self, key: jax.Array) -> jax.Array:
         """(d,) coordinates of the truth."""

@@ -23,12 +23,8 @@ _FIELDS = {"suggest": (), "observed": ("outcome", "design", "number"), "state": 
 
 
 def answers(loop: Loop, lines: Iterable[str]) -> Iterator[str]:
-    """The answer to each line, with its newline; empty lines have none.
-
-    Args:
-        loop: the session. An outcome is in its journal before it is answered.
-        lines: of requests, as a file gives them.
-    """
+    """The answer to each line of requests, with its newline; empty lines have none. An
+    outcome is in the journal of the session before it is answered."""
     for line in lines:
         if line.strip():
             try:

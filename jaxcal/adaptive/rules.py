@@ -34,12 +34,9 @@ def groups_of(task: Any, count: int) -> tuple[jax.Array, int]:
 def shortlist(
     task: Any, score: jax.Array, options: Options, per_group: int
 ) -> tuple[jax.Array, jax.Array]:
-    """The allowed options of the largest scores (A,), at most ``per_group`` a group.
-
-    Returns:
-        (C,) int32 indices and (C,) bool where one is listed: a group of fewer options
-        leaves places void.
-    """
+    """(C,) int32 indices of the allowed options of the largest scores (A,), at most
+    ``per_group`` a group, and (C,) bool where one is listed: a group of fewer options
+    leaves places void."""
     score = jnp.where(options.allowed, score, -jnp.inf)
     groups, number = groups_of(task, len(score))
     values, index = jax.vmap(
@@ -107,10 +104,8 @@ class Rule(abc.ABC):
     def price(
         self, task: Any, session: Session, options: Options, *expected: jax.Array
     ) -> jax.Array:
-        """(A,) what the measurements are taken to cost.
-
-        ``expected``: their gains, seconds and uses, (A,) each.
-        """
+        """(A,) what the measurements are taken to cost; ``expected``: their gains,
+        seconds and uses, (A,) each."""
 
     def judged(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array

@@ -154,12 +154,8 @@ class ArmOptions:
         return self.read(str(path), Table("", (self.kind,), column, {}, lines))
 
     def machine(self, path: str | None, table: Table | None) -> Model | None:
-        """The model in a file, an arm or another; None without one.
-
-        Raises:
-            OSError: the file cannot be read.
-            ValueError: naming the file and what is wrong in it.
-        """
+        """The model in a file, an arm or another; None without one. A ValueError names
+        the file and what is wrong in it."""
         if path and path.lower().endswith(".urdf"):
             return self.read(path, table)
         if self != ArmOptions():
@@ -179,14 +175,9 @@ class ArmOptions:
         chosen: str | None = None,
         but: Sequence[str] = (),
     ) -> tuple[str, ...]:
-        """The columns of the commands: those of the model's inputs where it has names.
-
-        Args:
-            model: None for an affine one.
-            table: whose columns they are.
-            chosen: by --inputs.
-            but: columns that hold something else.
-        """
+        """The columns of the commands, those of the model's inputs where it has names;
+        None is an affine model. ``chosen``: by --inputs; ``but``: columns that hold
+        something else."""
         inputs = tuple(getattr(model, "inputs", ()))
         if not inputs:
             return table.commands(chosen, but=but)
@@ -247,12 +238,8 @@ class RecordingOptions:
     ] = False
 
     def table(self, path: str, arm: Any) -> Table | None:
-        """The rests of a recording as a table, degrees; None where it is a table.
-
-        Args:
-            path: of a table or a recording.
-            arm: gives the arm of the recording; called with its ``which``.
-        """
+        """The rests of a recording as a table, degrees; None where the path is of a
+        table. ``arm(which)`` gives the arm of the recording."""
         if not is_recording(path):
             if self.which is not None or self.topic or self.in_degrees:
                 raise ValueError(

@@ -154,10 +154,8 @@ def commands_for(
     *,
     radians: bool = False,
 ) -> tuple[tuple[str, ...], Array]:
-    """The columns of the commands of a calibration in a table, and (N, n) they hold.
-
-    ``radians``: of an arm, whose commands are then made degrees.
-    """
+    """The columns of the commands of a calibration in a table, and (N, n) they hold;
+    ``radians``: of an arm, whose commands are then made degrees."""
     model: Any = calibration.model
     if radians and not is_arm(model):
         raise ValueError("--radians needs an arm")
@@ -334,10 +332,8 @@ def _readings(
     *,
     of_urdf: bool,
 ) -> tuple[Array, Array, Sequence[str], Sequence[str]]:
-    """Commands (N, n), readings (N, m) and their columns: u_ and y_, or those named.
-
-    ``of_urdf``: those named as the arm's joints and its sensor's; contacts have none.
-    """
+    """Commands (N, n), readings (N, m) and their columns: u_ and y_, or those named;
+    ``of_urdf``: as the arm's joints and its sensor's; contacts have none."""
     contacts = of_urdf and machine.sensor.contacts
     if contacts and outputs:
         raise ValueError(f"contacts have no readings: leave out --outputs {outputs}")

@@ -55,12 +55,8 @@ Tables are CSV, with or without a header; - is standard input."""
 
 
 def run(argv: list[str] | None = None) -> int:
-    """Run one command.
-
-    Returns:
-        The exit code: 0, 1 where a calibration is not good, 2 where something given
-        was wrong, 130 after Ctrl-C.
-    """
+    """Run one command: the exit code is 0, 1 where a calibration is not good, 2 where
+    something given was wrong, 130 after Ctrl-C."""
     words = [*(sys.argv[1:] if argv is None else argv)]
     if words and words[0] in _WHOLE:
         module = importlib.import_module(f"jaxcal.commands.{words[0]}")

@@ -221,11 +221,8 @@ def plan(
 
 
 def _rows_of(subset: Table, table: Table) -> NDArray[np.int64]:
-    """(k,) rows of the table, by the column ``index`` of what ``select`` wrote.
-
-    Raises:
-        ValueError: the numbers beside it are not those of the table's row.
-    """
+    """(k,) rows of the table, by the column ``index`` of what ``select`` wrote; refused
+    where the numbers beside it are not those of the table's row."""
     column = subset.columns(["index"])[:, 0]
     for line, number in zip(subset.lines, column, strict=True):
         if not (number == round(number) and 0 <= number < len(table)):

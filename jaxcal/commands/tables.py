@@ -33,10 +33,8 @@ class Output:
     def written(
         self, names: Sequence[str], rows: Sequence[Sequence[Any]], document: Any = None
     ) -> bool:
-        """Write where a form or a file is asked for; False where neither is.
-
-        As JSON the document, an object for each row where there is none.
-        """
+        """Write where a form or a file is asked for; False where neither is. As JSON
+        the document, an object for each row where there is none."""
         if self.json and self.csv:
             raise ValueError("Leave out --json or --csv")
         ending = pathlib.PurePath(self.out).suffix.lower()
@@ -95,11 +93,11 @@ def read_pool(path: str) -> tuple[Array, Any]:
     return table.columns(table.commands(None, option=None), mask), mask
 
 
-def draw_sets(path: str, episodes: int, seed: int, size: int = 50) -> Array:
-    """(episodes, M, n): of each episode M of the available rows, at most ``size``."""
+def draw_sets(path: str, episodes: int, seed: int) -> Array:
+    """(episodes, M, n): of each episode M of the available rows, at most 50."""
     rows, mask = read_pool(path)
     rows = rows if mask is None else rows[mask]
     rng = np.random.default_rng(seed)
-    count = min(size, len(rows))
+    count = min(50, len(rows))
     picked = [rng.choice(len(rows), count, replace=False) for _ in range(episodes)]
     return rows[np.stack(picked)]

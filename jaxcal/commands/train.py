@@ -18,11 +18,18 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.arguments import refused, told, typed_line
 from jaxcal.checks import aligned
+from jaxcal.commands.train_configuration import (
+    TrainOptions,
+    fixed_validation,
+    of_postures,
+    of_task,
+    read,
+    teacher,
+)
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.learning.runtime import processes
 
 if TYPE_CHECKING:
-    from jaxcal.commands.train_arguments import TrainOptions
     from jaxcal.learning.training.presets import TrainConfig
     from jaxcal.learning.training.run import Report
 
@@ -43,8 +50,6 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
         processes.keep_compiled_programs()
         try:
             with needs("policy", "training"):
-                from jaxcal.commands.train_arguments import read
-
                 arguments = read(prog, words)
             with told():
                 return _run(arguments, prog)
@@ -64,8 +69,6 @@ def _run(arguments: TrainOptions, prog: str) -> int:
             arguments.task = _task_held(out)
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export takes a file NAME.npz, got {arguments.export}")
-    from jaxcal.commands.train_configuration import of_postures, of_task
-
     made_by = of_task if arguments.task else of_postures
     configure: Any = functools.partial(made_by, arguments, out)
     jax, config = sys.modules.get("jax"), None
@@ -128,35 +131,31 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
     trainer: Any
     more: dict[str, Any] = {}
     first = devices.is_first()
-    validates = first and not (arguments.task or arguments.no_validation)
     if arguments.task:
         from jaxcal.adaptive.policy import training as trainer
 
-        schema, unit, columns = trainer.SCHEMA, "decisions", _TASK
+        schema, columns = trainer.SCHEMA, _TASK
         introduction = f"task {config.task}, seed {config.seed}; run folder {out}"
     else:
-        from jaxcal.commands.train_configuration import fixed_validation, teacher
         from jaxcal.learning.training import checkpoint
         from jaxcal.learning.training import postures as trainer
 
         rows = config.ppo.rows_per_minibatch
         mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
-        schema, unit, columns = checkpoint.SCHEMA, "episodes", _POSTURES
+        schema, columns = checkpoint.SCHEMA, _POSTURES
         introduction = _introduction(config, out, devices.describe(mesh))
-        more = {"validation": None, "teacher": teacher}
+        more = {"teacher": teacher}
     if first:
         print(f"{introduction}\nconfiguration:")
-        print(
-            pprint.pformat(config.as_meta(), width=88, compact=True, sort_dicts=False)
-        )
-        if validates:
+        pprint.pp(config.as_meta(), width=88, compact=True)
+        if not (arguments.task or arguments.no_validation):
             more["validation"] = fixed_validation(config)
         reward, *measured = columns
         heads = f"{reward:>8} " + " ".join(f"{name:>16}" for name in measured)
         print(
             "compiling the training step (some 15 s; a few seconds where this "
             "machine has compiled it before) ...\n"
-            f"   update {unit:>10}     /s   elapsed      left {heads}",
+            f"   update {config.ppo.unit:>10}     /s   elapsed      left {heads}",
             flush=True,
         )
     state = trainer.train(

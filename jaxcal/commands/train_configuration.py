@@ -1,35 +1,218 @@
-"""What ``train`` begins with: a configuration, sets to validate on, what to imitate."""
+"""What ``train`` is given and begins with: flags, from the fields of configurations, a
+configuration, the user's own postures, sets to validate on, what to imitate."""
 
 from __future__ import annotations
 
 import dataclasses
 import pathlib
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from jaxcal.adaptive.policy.config import PolicyConfig
-from jaxcal.commands.train_arguments import (
-    TASK_PARTS,
-    TrainOptions,
-    candidates_of,
-    flag_of,
-    given_flags,
-    trained_on,
-)
+from jaxcal.adaptive.policy.config import PPO, PolicyConfig
+from jaxcal.arguments import Parser, typed_line, values_of
+from jaxcal.commands.tables import holds_sets, read_pool
 from jaxcal.extras import needs
 from jaxcal.files import require_writable_folder
-from jaxcal.learning.config import settings_of
+from jaxcal.learning.config import StreamsConfig, settings_of
 from jaxcal.learning.environments.task import GivenCandidates
+from jaxcal.learning.runtime import processes
 from jaxcal.learning.training import presets
 from jaxcal.learning.training.presets import TrainConfig
-from jaxcal.selection import exact_batch, exchange_batch
 
 if TYPE_CHECKING:
     from jaxcal.learning.training.postures import Validation
 
+_EPILOG = """\
+presets for postures:
+{presets}
+
+tasks of sequential measurement:
+{tasks}
+  FILE.py   your own: a file that defines ENTRY (docs/adaptive.md)
+
+what to try first:
+  {program}                        the compact policy, half a minute on one core
+  {program} --episodes 20000 --out runs/brief   quicker, to try things
+  {program} --num-selected 6 --out runs/six     another number of postures
+  {program} --candidates mine.csv --out runs/mine   your own machine's postures
+  then --imitation 0.5 --initial-trust 4 --initial-actor 0.05, which helps most
+  when more than n + 1 postures are chosen. Other settings rarely need a change.
+
+more examples:
+  {program} --task knee            choose each measurement from the last results
+  {program} --seeds 8 --out runs/seeds   eight runs side by side: mean, spread, best
+  {program} --resume --out runs/compact      resume a run
+  {program} --resume --episodes 200000 --out runs/compact   and extend it
+  {program} --preset general --export checkpoints/default.npz   the shipped policy
+  {program} --trainer brax --episodes 50000  the same task, brax's own PPO
+  srun {program}                             all tasks of a SLURM job step
+
+A run folder holds metrics.csv and checkpoint/. Evaluate it with
+  {evaluate} --checkpoint runs/compact
+Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
+All devices of all processes share each update: docs/scaling.md."""
+
+TASK_PARTS = (StreamsConfig, PolicyConfig)
+# Settings that the first screen of the help shows; --help all shows the others.
+FIRST = {"seed", "seeds", "learning_rate", "width", "episodes", "updates", "kind"} | {
+    *("num_selected", "num_candidates", "num_inputs", "imitation")
+}
 _VALIDATED = 500  # sets that a training run is measured on
+_NAMES = {"num_episodes": "episodes", "num_updates": "updates", "num_seeds": "seeds"}
+
+
+@dataclasses.dataclass
+class TrainOptions:
+    """What is trained and where it is kept."""
+
+    RARE: ClassVar[Any] = {"no_validation", "devices"}
+
+    preset: Annotated[str | None, "for postures, see below [compact]", "NAME"] = None
+    task: Annotated[str | None, "of sequential measurement, see below", "NAME"] = None
+    with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = ()
+    out: Annotated[str | None, "run folder [runs/PRESET or runs/TASK]", "DIR"] = None
+    resume: Annotated[bool, "resume from the run folder's checkpoint"] = False
+    candidates: Annotated[
+        str | None,
+        "train on your own postures: a table (.csv) of postures, from which every "
+        "episode draws --num-candidates, or a dataset (.csv or .npz) of candidate sets",
+        "FILE",
+    ] = None
+    trainer: Annotated[
+        Literal["jaxcal", "brax"], "jaxcal's own PPO, or brax's on the same environment"
+    ] = "jaxcal"
+    export: Annotated[
+        str | None, "also write the finished policy to one file, NAME.npz", "FILE"
+    ] = None
+    no_validation: Annotated[
+        bool, "do not measure the gap to the proven optimum during training"
+    ] = False
+    devices: Annotated[int | None, "devices of each process [all]"] = None
+    # What the other flags set: field of a configuration to value.
+    values: dict[str, Any] = dataclasses.field(default_factory=dict, init=False)
+
+    @property
+    def preset_name(self) -> str:
+        """The preset that was given; else the smallest."""
+        return self.preset or "compact"
+
+
+def flag_of(name: str) -> str:
+    """The flag that sets a field."""
+    return "--" + _NAMES.get(name, name).rstrip("_").replace("_", "-")
+
+
+def _settings(*parts: Any) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
+    """By name: the fields of configurations that a command shows, and their values."""
+    return {
+        f.name: (f, getattr(part, f.name)) for part in parts for f in settings_of(part)
+    }
+
+
+def _flags(title: str, settings: Iterable[tuple[dataclasses.Field[Any], Any]]) -> type:
+    """A dataclass of settings, None where one is not given, as ``Parser.of`` reads."""
+    shown: dict[Any, str] = {int: "N", float: "X", str: "NAME", bool: ""}
+    kinds = {kind.__name__: kind for kind in shown}
+    fields = []
+    for field, value in settings:
+        single = kinds[str(field.type)]
+        kind: Any = single | None
+        said = Annotated[kind, f"{field.metadata['help']} [{value}]", shown[single]]
+        default = dataclasses.field(default=None)
+        fields.append((_NAMES.get(field.name, field.name), said, default))
+    about = "in brackets: the value of compact"
+    rare = {name for name, *_ in fields} - FIRST
+    return dataclasses.make_dataclass(
+        "Settings", fields, namespace={"TITLE": title, "ABOUT": about, "RARE": rare}
+    )
+
+
+_RUN = presets.load("compact")
+_POSTURES = _settings(_RUN, _RUN.ppo, _RUN.network, _RUN.tasks[0].environment)
+_TASKS = _settings(PPO, PolicyConfig)
+_ONE = [field for name, field in _POSTURES.items() if name not in _TASKS]
+_OTHER = [field for name, field in _TASKS.items() if name not in _POSTURES]
+_BOTH = [field for name, field in _POSTURES.items() if name in _TASKS]
+Shared = _flags("for postures and tasks", _BOTH)
+OfPostures = _flags("for postures, in presets of one task", _ONE)
+OfTasks = _flags("of tasks", _OTHER)
+
+
+def asked(
+    options: TrainOptions,
+    job: processes.Job,
+    shared: Shared,  # type: ignore[valid-type]  # made of the configurations
+    postures: OfPostures,  # type: ignore[valid-type]
+    tasks: OfTasks,  # type: ignore[valid-type]
+) -> TrainOptions:
+    """The options, with the settings that were given; the flags of ``train``."""
+    fields = {flag: name for name, flag in _NAMES.items()}
+    for part in (shared, postures, tasks):
+        options.values |= {
+            fields.get(name, name): value
+            for name, value in vars(part).items()
+            if value is not None
+        }
+    return options
+
+
+def read(prog: str, argv: Sequence[str]) -> TrainOptions:
+    """The command line; ``prog`` is what was typed, "train.py" or "jaxcal train"."""
+    more = None
+    if {"-h", "--help"} & set(argv):  # else tasks are not loaded, nor JAX with them
+        from jaxcal.adaptive.tasks import registry
+
+        more = _EPILOG.format(
+            program=typed_line(prog),
+            evaluate=typed_line(prog.replace("train", "evaluate")),
+            presets=_abouts(presets),
+            tasks=_abouts(registry),
+        )
+    parser = Parser(
+        prog=prog,
+        usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
+        description=textwrap.fill(
+            "Train a policy and save it with everything it needs. The policy selects "
+            "postures, or with --task picks the next measurement. Without flags: our "
+            "network on geometric features. --preset paper: the paper's network on the "
+            "210 numbers of its observation. --preset observation: our network on "
+            "these numbers, by PPO alone.",
+            86,
+        ),
+        epilog=more,
+    ).of(asked)
+    return asked(**values_of(parser.parse_args(argv)))
+
+
+def given_flags(arguments: TrainOptions, task: bool) -> dict[str, Any]:
+    """The fields of a configuration that were given: name to value; a flag that the
+    task, or the preset, does not read is refused."""
+    flags, read = arguments.values, _TASKS if task else _POSTURES
+    others = ("preset", "candidates", "no_validation") if task else ("with_",)
+    unread = {*flags} - {*read} | {name for name in others if getattr(arguments, name)}
+    if task and arguments.trainer != "jaxcal":
+        unread.add("trainer")
+    if unread:
+        who = f"--task {arguments.task}" if task else f"preset {arguments.preset_name}"
+        it = "it" if len(unread) == 1 else "them"
+        names = ", ".join(sorted(map(flag_of, unread)))
+        raise ValueError(f"{who} does not use {names}: leave {it} out")
+    return flags
+
+
+def _abouts(known: Any) -> str:
+    """The lines on presets, or tasks, that the module or registry knows."""
+    lines = []
+    for name in known.names():
+        about = f"  {name:9} {known.load(name).about}"
+        lines += textwrap.wrap(about, 86, subsequent_indent=" " * 12)
+    return "\n".join(lines)
+
+
+# -- configurations --------------------------------------------------------------------
 
 
 def of_postures(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
@@ -166,12 +349,70 @@ def _refuse_to_overwrite(out: pathlib.Path) -> None:
         )
 
 
+# -- the user's own postures -----------------------------------------------------------
+
+
+def candidates_of(path: str) -> GivenCandidates:
+    """The user's own, each axis mapped to [0, 1] over the whole file: the best postures
+    do not depend on the unit; float32 and the paper's network do."""
+    from jaxcal.evaluation.dataset import load_dataset
+
+    if holds_sets(path):
+        dataset = load_dataset(path)
+        values, available = dataset.candidates, dataset.available
+    else:
+        rows, mask = read_pool(path)
+        values, available = rows[None], None if mask is None else mask[None]
+    used = values if available is None else values[available]
+    used = used.reshape(-1, used.shape[-1])
+    low, high = used.min(axis=0), used.max(axis=0)
+    for axis in np.flatnonzero(~(low < high)):  # also where a cell is empty
+        raise ValueError(
+            f"{path}: input {axis + 1} must hold numbers that differ, got "
+            f"{low[axis]:g} to {high[axis]:g}: leave its column out"
+        )
+    return GivenCandidates(
+        name=pathlib.Path(path).name,
+        values=((values - low) / (high - low)).astype(np.float32),
+        available=available,
+    )
+
+
+def trained_on(
+    config: TrainConfig, candidates: GivenCandidates, given: dict[str, Any]
+) -> TrainConfig:
+    """A preset of one task, on the user's candidates."""
+    assert candidates.values is not None  # it was just read
+    num_sets, m, n = candidates.values.shape
+    if len(config.tasks) > 1:
+        raise ValueError(
+            "--candidates needs a preset of one task, such as compact; "
+            f"{config.preset} has {len(config.tasks)}"
+        )
+    sizes = {"num_inputs": n, "num_outputs": n, "num_selected": n + 1}
+    fixed = {"num_inputs": n} | ({"num_candidates": m} if num_sets > 1 else {})
+    for name, value in fixed.items():
+        if given.get(name, value) != value:
+            raise ValueError(
+                f"{flag_of(name)} must be {value}, as in {candidates.name}, got "
+                f"{given[name]}: leave it out"
+            )
+    config = presets.with_values(config, sizes | fixed | given)
+    candidates.source(config.tasks[0].environment)  # refuses a pool that is too small
+    task = dataclasses.replace(config.tasks[0], given=candidates)
+    return dataclasses.replace(config, tasks=(task,))
+
+
+# -- of a run --------------------------------------------------------------------------
+
+
 def fixed_validation(config: TrainConfig) -> Validation:
     """500 uniform sets, never trained on, that depend on M and n of the first task
     only, or draws of the user's candidates; and their optima."""
     import jax
 
     from jaxcal.learning.training.postures import Validation
+    from jaxcal.selection import exact_batch
 
     task = config.tasks[0]
     env = task.environment
@@ -195,6 +436,8 @@ def teacher(
     """A ``postures.Teacher``: the proven optimum where k is the number of regressors;
     above it what Fedorov exchange finds, almost always that, in a time that does not
     depend on the shape of the candidates."""
+    from jaxcal.selection import exact_batch, exchange_batch
+
     required = given if given.shape[1] else None
     solve = exact_batch if k == candidates.shape[2] + 1 else exchange_batch
     solved = solve(candidates, k, available=available, required=required, num_outputs=1)

@@ -21,11 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
-from jaxcal.checks import Array, array_of, axis_letter, require_none
+from jaxcal.checks import Array, Mask, array_of, axis_letter, require_none
 from jaxcal.files import atomic_write
 from jaxcal.tables import COMMANDS, MEASURED, Table, parse
-
-Mask = NDArray[np.bool_]
 
 _KEYS = ("candidates", "measured", "available")
 _ENDS = ("low", "high")

@@ -162,33 +162,6 @@ def best_so_far(evaluation: PostureEvaluation) -> Figure:
     return figure
 
 
-def variances(
-    rows: Sequence[tuple[str, Array, tuple[Array, Array], dict[str, Any]]],
-    names: Sequence[str],
-    unit: str,
-) -> Figure:
-    """Variance of each parameter; ``rows``: label, (P,) variances, lower and upper
-    ends of their 95 % intervals, colour and marker."""
-    figure, axes = panels((8.0, 4.0))
-    look = {"linestyle": "none", "markersize": 4.5, "elinewidth": 0.9}
-    offsets = np.linspace(-0.3, 0.3, len(rows))
-    for (label, variance, (low, high), style), offset in zip(
-        rows, offsets, strict=True
-    ):
-        x = np.arange(len(names)) + offset
-        # A percentile interval need not hold the estimate.
-        error = np.maximum([variance - low, high - variance], 0.0)
-        axes.errorbar(x, variance, yerr=error, label=label, **style, **look)
-    for edge in np.arange(len(names) - 1) + 0.5:
-        axes.axvline(edge, color="#DDDDDD", linewidth=0.6, zorder=0)
-    axes.set_yscale("log")
-    axes.set_xticks(range(len(names)), names)
-    axes.set_xlabel("parameter (bars: 95 % intervals)")
-    axes.set_ylabel(f"variance over episodes ({unit})")
-    legend_right(axes)
-    return figure
-
-
 def _figure(
     evaluation: PostureEvaluation, title: str, height: float
 ) -> tuple[Figure, Any]:

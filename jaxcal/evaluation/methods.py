@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from jaxcal import selection
-from jaxcal.checks import Array, one_of, whole_number
+from jaxcal.checks import Array, Indices, one_of, whole_number
 from jaxcal.deadline import Deadline
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.report import (
@@ -31,7 +31,6 @@ from jaxcal.information.regression import log_det_gram
 from jaxcal.models.linear import Affine
 from jaxcal.selection.problem import make_problems
 
-Indices = NDArray[np.int64]
 T = TypeVar("T")
 Progress = Callable[[str, int, int], None]
 """label, selections done, selections in all"""
@@ -437,12 +436,3 @@ def least_squares(commands: Array, measured: Array) -> Array:
     biases = (mean_y - mean_u @ slopes)[..., 0, :]
     matrix = np.matrix_transpose(slopes)
     return np.concatenate([matrix.reshape(*biases.shape[:-1], -1), biases], axis=-1)
-
-
-def predict(parameters: Array, commands: Array) -> Array:
-    """(..., N, m) outputs at (..., N, n) commands, of the ``parameters`` (..., m (n +
-    1)) of ``least_squares``."""
-    n = commands.shape[-1]
-    m = parameters.shape[-1] // (n + 1)
-    matrix = parameters[..., : m * n].reshape(*parameters.shape[:-1], m, n)
-    return commands @ np.matrix_transpose(matrix) + parameters[..., None, m * n :]

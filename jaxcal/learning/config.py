@@ -11,8 +11,8 @@ import importlib
 import importlib.util
 import pathlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
 SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform")
 """Shapes of a cloud of candidates, see ``environments.selection.mixture``."""
@@ -20,25 +20,14 @@ SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform
 _OWN = "jaxcal.own "  # before the path of a file, in the name of its module
 
 
-class Setting(NamedTuple):
-    """One field of a configuration, as a command shows it."""
-
-    name: str
-    kind: type  # bool, int, float or str
-    help: str
-
-
 def setting(default: Any, help: str) -> Any:
     """A dataclass field with a default and a line of help; commands print the line."""
     return dataclasses.field(default=default, metadata={"help": help})
 
 
-def settings_of(config: type) -> Iterator[Setting]:
-    kinds: dict[Any, Any] = {kind.__name__: kind for kind in (bool, int, float, str)}
-    for field in dataclasses.fields(config):
-        if "help" in field.metadata:
-            kind = kinds.get(field.type, field.type)  # written as text, mostly
-            yield Setting(field.name, kind, field.metadata["help"])
+def settings_of(config: Any) -> list[dataclasses.Field[Any]]:
+    """The fields of a configuration, or of its class, that a command shows."""
+    return [field for field in dataclasses.fields(config) if "help" in field.metadata]
 
 
 def require(config: Any, rule: str, holds: Callable[[Any], bool], *names: str) -> None:

@@ -325,7 +325,7 @@ def test_a_sweep_of_one_axis_is_one(ask):
 
 
 def test_train_reads_the_same_columns(tmp_path, caplog):
-    from jaxcal.commands.train_arguments import candidates_of
+    from jaxcal.commands.train_configuration import candidates_of
 
     table = {"id": np.arange(12.0)} | {axis: COMMANDED[axis] for axis in AXES}
     (tmp_path / "t.csv").write_text(text_of(table))

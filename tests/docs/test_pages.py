@@ -116,7 +116,7 @@ def parse(words: list[str]) -> None:
     """Refused by exit code 2 where a flag or a value is wrong."""
     from jaxcal.commands.evaluate import parser as evaluate_parser
     from jaxcal.commands.program import _parser
-    from jaxcal.commands.train_arguments import read as read_train
+    from jaxcal.commands.train_configuration import read as read_train
     from rig.commands import make_parser
 
     ends = [i for i, word in enumerate(words) if word in ("|", ">", "&&")]

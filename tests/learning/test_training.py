@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from jaxcal.commands import train as command
-from jaxcal.commands import train_arguments
+from jaxcal.commands import train_configuration
 from jaxcal.learning.config import EpisodesConfig, named
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import GivenCandidates, Task
@@ -363,7 +363,7 @@ def test_a_network_and_a_task_may_be_in_a_file(tmp_path):
         "@dataclasses.dataclass(frozen=True)\nclass Own(Task):\n"
         "    price: float = 2.0\n"
     )
-    options = train_arguments.read("train.py", ["--kind", f"{file}:Net"])
+    options = train_configuration.read("train.py", ["--kind", f"{file}:Net"])
     config = presets.with_values(CONFIG, options.values)
     assert build(config.network).extra == 5
     own = named(f"{file}:Own")(SelectionConfig(8, 3, 2, 2), price=3.0)
@@ -580,10 +580,10 @@ def test_ones_own_sets_are_drawn_as_they_are(tmp_path, rng, key):
     sets, free = rng.uniform(-30, 30, size=(5, 7, 2)), rng.random((5, 7)) < 0.8
     free[:, :4] = True
     np.savez(tmp_path / "sets.npz", candidates=sets, available=free)
-    given = train_arguments.candidates_of(str(tmp_path / "sets.npz"))
+    given = train_configuration.candidates_of(str(tmp_path / "sets.npz"))
     low, high = sets[free].min(0), sets[free].max(0)
     np.testing.assert_allclose(given.values, (sets - low) / (high - low), rtol=1e-5)
-    config = train_arguments.trained_on(presets.load("compact"), given, {})
+    config = train_configuration.trained_on(presets.load("compact"), given, {})
     task = config.tasks[0]
     assert (task.environment.num_candidates, task.num_decisions) == (7, 3)
     states = jax.vmap(task.reset)(jax.random.split(key, 40))
@@ -595,11 +595,11 @@ def test_ones_own_sets_are_drawn_as_they_are(tmp_path, rng, key):
         seen.add(which)
     assert len(seen) == 5
     with pytest.raises(ValueError, match="--num-candidates must be 7, as in"):
-        train_arguments.trained_on(
+        train_configuration.trained_on(
             presets.load("compact"), given, {"num_candidates": 9}
         )
     with pytest.raises(ValueError, match="one task"):
-        train_arguments.trained_on(presets.load("general"), given, {})
+        train_configuration.trained_on(presets.load("general"), given, {})
 
 
 def test_ctrl_c_saves_and_resume_goes_on(tmp_path, capsys, monkeypatch):

@@ -19,11 +19,11 @@ from benchmarks.paper.exhibits.intervals import (
     ratio_interval,
     share_interval,
 )
-from benchmarks.paper.exhibits.study import Settings, Study
+from benchmarks.paper.exhibits.study import Settings, Study, predict
 from benchmarks.paper.exhibits.training import exhibits, kept_runs, plateau
 from benchmarks.paper.exhibits.variance import variance_table
 from jaxcal.calibration.identify import identify
-from jaxcal.evaluation.methods import least_squares, predict
+from jaxcal.evaluation.methods import least_squares
 from jaxcal.reports.plots import as_bytes
 from jaxcal.tables import csv_text
 

@@ -23,8 +23,8 @@ from benchmarks.paper.exhibits.intervals import (
     ratio_interval,
     share_interval,
 )
-from benchmarks.paper.exhibits.study import Study, commands_deg
-from jaxcal.evaluation.methods import least_squares, predict
+from benchmarks.paper.exhibits.study import Study, commands_deg, predict
+from jaxcal.evaluation.methods import least_squares
 from jaxcal.information.regression import regressors
 from jaxcal.paper.datasets import NOISE_STD_DEG
 from jaxcal.reports.plots import BLACK, band, numbered, panels, plain_log

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from benchmarks.paper.datasets import dataset0_robot
 from benchmarks.paper.exhibits.exhibit import Exhibit, by_axis, judge
 from benchmarks.paper.exhibits.intervals import mean_interval, share_interval
-from benchmarks.paper.exhibits.study import Study, commands_deg
+from benchmarks.paper.exhibits.study import Study, commands_deg, predict
 from benchmarks.paper.twin import ORDERS, RobotConfig, read_out, simulate
 from jaxcal.calibration.identify import identify
-from jaxcal.evaluation.methods import least_squares, predict
+from jaxcal.evaluation.methods import least_squares
 from jaxcal.models import Affine
 from jaxcal.paper.datasets import AXES, BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
 from jaxcal.reports.plots import BLACK, COLOURS, boxes, legend_right, panels

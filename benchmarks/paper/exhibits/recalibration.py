@@ -22,8 +22,8 @@ from benchmarks.paper.exhibits.intervals import (
     ratio_interval,
     share_interval,
 )
-from benchmarks.paper.exhibits.study import Study, choose
-from jaxcal.evaluation.methods import least_squares, predict
+from benchmarks.paper.exhibits.study import Study, choose, predict
+from jaxcal.evaluation.methods import least_squares
 from jaxcal.paper.datasets import AXES, NOISE_STD_DEG, RANGES
 from jaxcal.reports.plots import (
     BLACK,

@@ -174,3 +174,12 @@ class Study:
             f" The episodes are draws from {distinct:,} postures and overlap: "
             "intervals over them say nothing about another recording."
         )
+
+
+def predict(parameters: Array, commands: Array) -> Array:
+    """(..., N, m) outputs at (..., N, n) commands, of the ``parameters`` (..., m (n +
+    1)) of ``least_squares``."""
+    n = commands.shape[-1]
+    m = parameters.shape[-1] // (n + 1)
+    matrix = parameters[..., : m * n].reshape(*parameters.shape[:-1], m, n)
+    return commands @ np.matrix_transpose(matrix) + parameters[..., None, m * n :]

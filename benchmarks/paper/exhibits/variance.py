@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.paper.exhibits.exhibit import Exhibit, judge
 from benchmarks.paper.exhibits.selection import STREAM, words_of
 from benchmarks.paper.exhibits.study import METHODS, Study
-from jaxcal.evaluation import figures
 from jaxcal.models import Affine
-from jaxcal.reports.plots import BLACK, COLOURS, GREY
+from jaxcal.reports.plots import BLACK, COLOURS, GREY, legend_right, panels
 
 Array = NDArray[np.float64]
 
@@ -91,7 +92,7 @@ def _variance(study: Study, name: str, key: str, title: str) -> Exhibit:
             ("all 50", "all 50 postures", COLOURS[2], "^"),
         )
     ]
-    figure = figures.variances(rows, names, "A: no unit, b: deg²")
+    figure = _drawn(rows, names, "A: no unit, b: deg²")
     text = f"Cross-episode variance of the identified parameters: {name}"
     figure.axes[0].set_title(text, fontsize=10)
     (ratio, low, _), fifty = table["random/policy"], table["all 50/policy"]
@@ -130,3 +131,30 @@ def _parameter_columns(
     values = np.concatenate([p.reshape(-1, len(names)) for p in parameters.values()])
     heads = zip(("method", "episode", "draw"), zip(*places, strict=True), strict=True)
     return dict(heads) | dict(zip(names, values.T, strict=True))
+
+
+def _drawn(
+    rows: Sequence[tuple[str, Array, tuple[Array, Array], dict[str, Any]]],
+    names: Sequence[str],
+    unit: str,
+) -> Figure:
+    """Variance of each parameter; ``rows``: label, (P,) variances, lower and upper
+    ends of their 95 % intervals, colour and marker."""
+    figure, axes = panels((8.0, 4.0))
+    look = {"linestyle": "none", "markersize": 4.5, "elinewidth": 0.9}
+    offsets = np.linspace(-0.3, 0.3, len(rows))
+    for (label, variance, (low, high), style), offset in zip(
+        rows, offsets, strict=True
+    ):
+        x = np.arange(len(names)) + offset
+        # A percentile interval need not hold the estimate.
+        error = np.maximum([variance - low, high - variance], 0.0)
+        axes.errorbar(x, variance, yerr=error, label=label, **style, **look)
+    for edge in np.arange(len(names) - 1) + 0.5:
+        axes.axvline(edge, color="#DDDDDD", linewidth=0.6, zorder=0)
+    axes.set_yscale("log")
+    axes.set_xticks(range(len(names)), names)
+    axes.set_xlabel("parameter (bars: 95 % intervals)")
+    axes.set_ylabel(f"variance over episodes ({unit})")
+    legend_right(axes)
+    return figure

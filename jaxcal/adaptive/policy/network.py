@@ -232,11 +232,9 @@ class Sessions:
         action: jax.Array,
         key: jax.Array,
     ) -> Step:
-        """Make a measurement; its reward is the information it is expected to give.
-
-        The gain is estimated from independent draws: the design was chosen by those of
-        the shortlist, so their estimate is too large.
-        """
+        """Make a measurement; its reward is the information it is expected to give, by
+        draws of its own: the design was chosen by those of the shortlist, so their
+        estimate is too large."""
         made, belief = task.task, state.belief
         key_outcome, key_update, key_gain = jax.random.split(key, 3)
         design = jax.tree.map(lambda leaf: leaf[action], observation.designs)

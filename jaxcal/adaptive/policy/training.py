@@ -14,7 +14,7 @@ from jaxcal.adaptive.policy.config import PolicyConfig
 from jaxcal.adaptive.policy.network import Exercise, PolicyDecider, initial
 from jaxcal.adaptive.tasks import registry
 from jaxcal.learning.core.ppo import TrainState
-from jaxcal.learning.runtime import devices, weights
+from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import Weights
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.checkpoint import CheckpointError
@@ -48,78 +48,51 @@ class TaskPolicy:
 
 
 def exercise(config: PolicyConfig) -> Exercise:
-    """What ``make_train(config)`` is given.
-
-    Numbers are arrays, so that other constants do not compile again.
-
-    Raises:
-        ValueError: the registry or the task refuses its options.
-    """
+    """What ``make_train(config)`` is given; numbers are arrays, so that other constants
+    do not compile again. The registry or the task may refuse its options."""
     task = registry.load(config.task).make(**config.options)
-    made: Exercise = jax.tree.map(jnp.asarray, Exercise(task, config.base))
-    return made
+    return jax.tree.map(jnp.asarray, Exercise(task, config.base))
 
 
-def train(
-    config: PolicyConfig,
-    folder: str | pathlib.Path,
-    *,
-    num_devices: int | None = None,
-    **rest: Any,
-) -> TrainState:
+def train(config: PolicyConfig, folder: str | pathlib.Path, **rest: Any) -> TrainState:
     """Train until the budget is spent or ``should_stop`` says so, and save.
 
     It is validated on fresh sessions: ``nats`` of the averaged weights, and
-    ``nats_over_base`` in pairs.
+    ``nats_over_base`` in pairs. The registry or the task may refuse its options.
 
     Args:
         config: the run.
         folder: of the run; made where missing.
-        num_devices: devices of each process; all when None.
-        rest: ``resume``, ``report``, ``should_stop`` and ``num_updates`` of
-            ``training.run.run``.
-
-    Raises:
-        CheckpointError: nothing to resume from, or damaged.
-        ValueError: the registry or the task refuses its options, or the devices cannot
-            share a minibatch evenly.
-        OSError: the folder cannot be written.
+        rest: ``num_devices``, ``resume``, ``report``, ``should_stop`` and
+            ``num_updates`` of ``training.run.run``, whose errors are raised too.
     """
-    rows = config.ppo.rows_per_minibatch
-    mesh = devices.make_mesh(rows, num_devices, config.num_seeds)
     played = exercise(config)
     keys = jax.random.split(jax.random.key(_FRESH), _VALIDATED)
     task, base = played.task, played.base
     rules: list[float] = []  # nats of the base rule, once it is played
 
-    def validate(average: Any) -> dict[str, float]:
+    def validate(average: Any) -> tuple[float, float]:
         policy = PolicyDecider(average, base, config.per_group, config.width)
         if not rules:
             rules.append(float(play(task, base, keys).gain.mean()))
         nats = float(play(task, policy, keys).gain.mean())
-        return dict(zip(MEASURED, (nats, nats - rules[0]), strict=True))
+        return nats, nats - rules[0]
 
     recipe = Recipe(
         config=config,
-        given=(devices.replicate(played, mesh),),
+        given=(played,),
         schema=SCHEMA,
         columns=("choices",),
         measured=MEASURED,
         validate=validate,
     )
-    return run(recipe, folder, mesh=mesh, **rest)
+    return run(recipe, folder, **rest)
 
 
 def load(path: str | pathlib.Path | None = None) -> TaskPolicy:
-    """A policy; with several seeds the best by validation.
-
-    Args:
-        path: a weights file or a training run's folder; the policy of KNEE that ships
-            when None.
-
-    Raises:
-        CheckpointError: there is none, it is damaged, or it is of another kind.
-    """
+    """The policy in a weights file or a run's folder, with several seeds the best by
+    validation; that of KNEE which ships when None. A CheckpointError where there is
+    none, it is damaged, or it is of another kind."""
     path = weights.shipped("knee") if path is None else path
     source, meta = checkpoint.read_meta(path, SCHEMA)
     try:

@@ -45,14 +45,9 @@ def names() -> list[str]:
 
 
 def load(name: str) -> Entry:
-    """A task's entry.
-
-    Args:
-        name: as registered, or a Python file that defines ``ENTRY``.
-
-    Raises:
-        ValueError: no such task, or a file that fails or has no entry.
-    """
+    """A task's entry, by its name as registered or in a Python file that defines
+    ``ENTRY``; a ValueError where there is no such task, or a file that fails or has no
+    entry."""
     if name.endswith(".py"):
         entry = _of_file(pathlib.Path(name))
     elif name in _OWN:
@@ -86,11 +81,8 @@ def _of_file(path: pathlib.Path) -> Any:
 
 
 def options_from(entry: Entry, given: Sequence[str]) -> dict[str, Any]:
-    """Options of a task from a command line, such as ``sigma=0.05``.
-
-    Raises:
-        ValueError: not NAME=VALUE, or a name that the task does not have.
-    """
+    """Options of a task from a command line, such as ``sigma=0.05``; refused where one
+    is not NAME=VALUE, or a name that the task does not have."""
     option_names = [
         name
         for name, parameter in inspect.signature(entry.make).parameters.items()

@@ -19,15 +19,9 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcal.learning.config import EpisodesConfig
+from jaxcal.learning.core import ppo
 from jaxcal.learning.core.network import Network, decode, encode, initial
-from jaxcal.learning.core.ppo import (
-    Batch,
-    Metrics,
-    advantages,
-    explained_variance,
-    normalised,
-    surrogate,
-)
+from jaxcal.learning.core.ppo import Batch, Metrics
 
 
 class Episode(Protocol):
@@ -142,10 +136,10 @@ class Postures:
             "reward_mean": reward.mean(),
             "reward_std": reward.std(),
             "log_det_mean": log_det.mean(),
-            "explained_variance": explained_variance(batch.target, value),
+            "explained_variance": ppo.explained_variance(batch.target, value),
         }
         after = jax.random.key_data(keys[:, 2])
-        return normalised(self.config, batch), after, metrics
+        return ppo.normalised(self.config, batch), after, metrics
 
     def loss(
         self, params: Any, experience: Batch, update_index: jax.Array
@@ -153,7 +147,7 @@ class Postures:
         """PPO loss of whole episodes."""
         score = jax.vmap(functools.partial(self._score, params))
         scores = score(experience.observations)
-        return surrogate(self.config, *scores, experience, update_index)
+        return ppo.surrogate(self.config, *scores, experience, update_index)
 
     def _score(
         self, params: Any, observations: RowInputs
@@ -262,7 +256,7 @@ class Postures:
         next_value = jnp.concatenate([rest[1:], jnp.zeros_like(rest[:1])])
         continues = jnp.ones_like(rest).at[-1].set(0.0)
         reward = played["reward"]
-        advantage = advantages(self.config, reward, rest, next_value, continues)
+        advantage = ppo.advantages(self.config, reward, rest, next_value, continues)
         target = advantage + played["value"]
         others = self.config.episodes_per_set - 1
         if others:

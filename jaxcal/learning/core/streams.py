@@ -17,14 +17,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcal.learning.config import StreamsConfig
-from jaxcal.learning.core.ppo import (
-    Batch,
-    Metrics,
-    advantages,
-    explained_variance,
-    normalised,
-    surrogate,
-)
+from jaxcal.learning.core import ppo
+from jaxcal.learning.core.ppo import Batch, Metrics
 
 
 @struct.dataclass
@@ -112,16 +106,16 @@ class Streams:
         metrics = {
             "reward_mean": reward / over,
             "choices": choices / over,
-            "explained_variance": explained_variance(batch.target, value),
+            "explained_variance": ppo.explained_variance(batch.target, value),
         }
-        return normalised(self.config, batch), rollout_state, metrics
+        return ppo.normalised(self.config, batch), rollout_state, metrics
 
     def loss(
         self, params: Any, experience: Batch, update_index: jax.Array
     ) -> tuple[jax.Array, Metrics]:
         """PPO loss of some streams."""
         logits, value = cast(Any, self.network.apply(params, experience.observations))
-        return surrogate(self.config, logits, value, experience, update_index)
+        return ppo.surrogate(self.config, logits, value, experience, update_index)
 
     def _play(
         self, params: Any, stream: Stream, task: Any
@@ -182,7 +176,8 @@ class Streams:
         value, continues = row["value"], 1.0 - row["ended"][0]
         then = jnp.concatenate([value[1:], last[None]])
         next_value = row["chance"] * continues * then + row["others"]
-        advantage = advantages(self.config, row["reward"], value, next_value, continues)
+        played = row["reward"], value, next_value, continues
+        advantage = ppo.advantages(self.config, *played)
         batch = Batch(
             observations=row["observation"],
             action=row["action"],

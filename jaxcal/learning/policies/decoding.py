@@ -15,18 +15,19 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.checks import Indices, Mask
+
 Array = NDArray[Any]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 class Scorer(Protocol):
-    """A network as decoding sees it."""
+    """A network as decoding sees it; a subclass has what is not abstract from here."""
 
     @property
     def piece_rows(self) -> int | None:
         """Candidates of all tries that are scored at a time, the pieces on every core;
         None where one call takes all."""
+        return None
 
     def encode(self, rows: Array, usable: Mask) -> Any:
         """What ``scores`` needs of sets: rows (B, M, p), of which the last column is 1
@@ -34,6 +35,7 @@ class Scorer(Protocol):
 
     def part(self, memory: Any, sets: Indices) -> Any:
         """The memory of E episodes on the ``sets`` (E,) of an encoded batch."""
+        return memory
 
     def scores(
         self, memory: Any, chosen: Indices, free: Mask, count: int, best_only: bool
@@ -44,6 +46,7 @@ class Scorer(Protocol):
 
     def worth(self, rows: Array, usable: Mask, tries: Indices) -> Array:
         """(B, T) by which the best of the tries (B, T, K) on each set is taken."""
+        return log_dets(rows, tries)
 
 
 def choose(

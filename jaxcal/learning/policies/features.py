@@ -28,9 +28,6 @@ _FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
 _RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
 _CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ
 
-AHEAD = ("gain", "best pair", "greedy triple", "greedy to the end")
-"""Choices that a look-ahead makes: 1, 2, 3 and all to the end."""
-
 
 class VectorFeatures(NamedTuple):
     """Inputs of the network from vectors y, one per candidate; those of numpy are in
@@ -41,8 +38,8 @@ class VectorFeatures(NamedTuple):
     moments: jax.Array  # (..., M, p (p + 1) / 2) products of coordinates, scaled so
     # that messages keep their size whatever M is
     active: jax.Array  # (..., M) bool, which candidates count
-    ahead: jax.Array  # (..., M, 4) AHEAD: log-volume after the greedy choices that
-    # begin with this candidate, relative to the best candidate's
+    ahead: jax.Array  # (..., M, 4) log-volume after 1, 2, 3 and all greedy choices
+    # that begin with this candidate, relative to the best candidate's
     best: jax.Array  # (..., 4) that of the best candidate
 
     @property

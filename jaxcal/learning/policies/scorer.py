@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,18 +19,14 @@ from jaxcal.learning.small_matrices import log_det_gram
 
 
 @dataclasses.dataclass(frozen=True)
-class NetworkScorer:
-    """The ``decoding.Scorer`` of a ``Network`` and its parameters."""
+class NetworkScorer(decoders.Scorer):
+    """A ``Network`` and its parameters; one piece, since XLA has threads of its own."""
 
-    piece_rows: ClassVar[None] = None  # XLA has threads of its own
     network: Network
     params: Any
 
     def encode(self, rows: NDArray[Any], usable: NDArray[np.bool_]) -> Any:
         return _encoded(self.network, self.params, rows[..., :-1], usable)
-
-    def part(self, memory: Any, sets: NDArray[np.int64]) -> Any:
-        return memory
 
     def scores(
         self,
@@ -50,11 +46,6 @@ class NetworkScorer:
             self.network, self.params, memory, choices, available, count, learned
         )
         return np.asarray(scores).reshape(free.shape)
-
-    def worth(
-        self, rows: NDArray[Any], usable: NDArray[np.bool_], tries: NDArray[np.int64]
-    ) -> NDArray[Any]:
-        return decoders.log_dets(rows, tries)
 
 
 @functools.partial(jax.jit, static_argnames="network")

@@ -165,11 +165,10 @@ def _first_line(error: Exception) -> str:
 def _read(path: pathlib.Path, like: Any, what: str) -> Any:
     """A tree of arrays that orbax saved, of the shapes and types of ``like``."""
     like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), like)
-    options = _alone()
     try:
         with (
             _quiet_after_failure(),
-            ocp.StandardCheckpointer(multiprocessing_options=options) as reader,
+            ocp.StandardCheckpointer(multiprocessing_options=_alone()) as reader,
         ):
             tree = reader.restore(path.absolute(), like)
         for leaf, wanted in zip(*map(jax.tree.leaves, (tree, like)), strict=True):

@@ -28,7 +28,6 @@ from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.core.ppo import Learner, Metrics, TrainState
 from jaxcal.learning.policies import scorer
 from jaxcal.learning.policies.networks import build
-from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.run import Recipe, run
@@ -201,10 +200,8 @@ class Validation:
         gap = np.asarray(scorer.log_det_of(candidates, indices)) - self.best
         # float32 values against a float64 optimum: equal to a few units in the last
         # place counts as hit; evaluate.py compares in float64.
-        return (
-            float(np.exp(self.num_outputs * np.minimum(gap, 0.0)).mean()),
-            float((gap > -2e-5).mean()),
-        )
+        ratio = np.exp(self.num_outputs * np.minimum(gap, 0.0))
+        return float(ratio.mean()), float((gap > -2e-5).mean())
 
 
 def train(
@@ -214,7 +211,6 @@ def train(
     validation: Validation | None = None,
     teacher: Teacher | None = None,
     num_updates: int | None = None,
-    num_devices: int | None = None,
     **rest: Any,
 ) -> TrainState:
     """Train until the budget is spent or ``should_stop`` says so, and save: the last
@@ -227,11 +223,9 @@ def train(
         validation: fixed sets to measure the averaged weights on.
         teacher: imitated by the first ``config.num_imitated`` updates.
         num_updates: stop after this update instead of at the end of the budget.
-        num_devices: devices of each process; all when None.
-        rest: ``resume``, ``report`` and ``should_stop`` of ``training.run.run``.
+        rest: ``num_devices``, ``resume``, ``report`` and ``should_stop`` of
+            ``training.run.run``.
     """
-    rows = config.ppo.rows_per_minibatch
-    mesh = devices.make_mesh(rows, num_devices, config.num_seeds)
     learners = config.learners
     network, k = build(config.network), config.tasks[0].num_decisions
     last = config.ppo.num_updates if num_updates is None else num_updates
@@ -258,20 +252,18 @@ def train(
         imitation = Imitation(learner.config, learner.task, learner.network)
         return imitation, lessons.at(index)
 
-    def validate(average: Any) -> dict[str, float]:
-        assert validation is not None  # else it is not called
-        measured = validation.measure(network, average, k)
-        return dict(zip(MEASURED, measured, strict=True))
-
+    validate = None
+    if validation is not None:
+        validate = functools.partial(validation.measure, network, k=k)
     recipe = Recipe(
         config=config,
         given=(),
         schema=checkpoint.SCHEMA,
         columns=("reward_std", "log_det_mean"),
         measured=MEASURED,
-        validate=None if validation is None else validate,
+        validate=validate,
         num_imitated=imitated,
         imitate=imitate,
     )
     with contextlib.closing(Lessons(lesson, imitated)) as lessons:
-        return run(recipe, folder, mesh=mesh, num_updates=last, **rest)
+        return run(recipe, folder, num_updates=last, **rest)

@@ -54,7 +54,7 @@ class Recipe:
     schema: str  # of the checkpoints
     columns: tuple[str, ...]  # further ones of metrics.csv, in every update
     measured: tuple[str, ...]  # columns of validations; the first ranks the seeds
-    validate: Callable[[Any], dict[str, float]] | None  # averaged weights -> measured
+    validate: Callable[[Any], tuple[float, ...]] | None  # averaged weights -> measured
     # The first updates imitate: their number; update -> its learner and argument.
     num_imitated: int = 0
     imitate: Callable[[int], tuple[Learner, Any]] | None = None
@@ -168,7 +168,7 @@ def run(
     recipe: Recipe,
     folder: str | pathlib.Path,
     *,
-    mesh: Mesh | None = None,
+    num_devices: int | None = None,
     resume: bool = False,
     report: Callable[[Report], None] = lambda report: None,
     should_stop: Callable[[], bool] = lambda: False,
@@ -179,19 +179,23 @@ def run(
     Args:
         recipe: what is trained.
         folder: of the run; made where missing.
-        mesh: the devices that share an update; None for one.
+        num_devices: of each process, that share an update; all when None.
         resume: go on from the newest checkpoint in ``folder``.
         report: called after the first and last update and every ``validate_every``.
         should_stop: asked between calls.
         num_updates: stop after this update instead of at the end of the budget.
 
     Raises:
+        ValueError: the devices cannot share a minibatch, or the seeds, evenly.
         DivergedError: losses are not finite in five updates in a row, in every run; the
             weights before are saved. Fewer are skipped.
         OSError: the folder cannot be written, or another training writes it.
     """
-    last = recipe.config.ppo.num_updates if num_updates is None else num_updates
-    root = pathlib.Path(folder)
+    config, root = recipe.config, pathlib.Path(folder)
+    shared = config.ppo.rows_per_minibatch, num_devices, config.num_seeds
+    mesh = devices.make_mesh(*shared)
+    everywhere = devices.replicate(recipe.given, mesh)
+    last = config.ppo.num_updates if num_updates is None else num_updates
     seeds = len(recipe.seeds) if len(recipe.seeds) > 1 else 0
     count, timed, broken = 1, False, ""
     in_row = np.zeros(len(recipe.seeds), int)  # updates skipped
@@ -207,7 +211,7 @@ def run(
             held.enter_context(contextlib.closing(recorder))
         while done < last and not broken and not devices.any_process(should_stop()):
             begun = time.perf_counter()
-            at_most, given = _UPDATES, recipe.given
+            at_most, given = _UPDATES, everywhere
             learner = recipe.learners[done % len(recipe.learners)]
             if done < recipe.num_imitated:
                 assert recipe.imitate is not None  # there are updates that imitate
@@ -216,7 +220,7 @@ def run(
             elif len(recipe.learners) > 1:
                 at_most = 1  # the next update has another program
             count = min(count, at_most, last - done)
-            update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
+            update = updates(config.ppo, learner, mesh, at_most, seeds)
             with collective():
                 state, metrics = update(state, np.int32(count), *given)
                 # One transfer for all that these updates measured.
@@ -333,7 +337,10 @@ class _Recorder:
                 policies = [
                     jax.tree.map(lambda x, i=i: x[i], average) for i in range(number)
                 ]
-            self._of_seeds = [recipe.validate(policy) for policy in policies]
+            self._of_seeds = [
+                dict(zip(recipe.measured, recipe.validate(policy), strict=True))
+                for policy in policies
+            ]
             for name in self._of_seeds[0]:
                 values = [seed[name] for seed in self._of_seeds]
                 row[name] = float(np.mean(values))
