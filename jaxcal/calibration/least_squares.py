@@ -364,7 +364,8 @@ class FitSolution:
             residuals = self._off(commands, theta, finite=False)
             white = self.whitened(residuals[..., None], theta)[..., 0]
             facts, fact_rows = problem.model.fitting.facts(theta)
-            after = self._cost(white, theta, commands, facts)
+            with np.errstate(over="ignore"):  # a step that is too long is not taken
+                after = self._cost(white, theta, commands, facts)
             if last:
                 ratio = 1.0
                 if not after <= cost * (1.0 + 1e-12) + 1e-12:

@@ -294,6 +294,7 @@ def test_uncertain_commands_are_estimated_beside_the_parameters(
     np.testing.assert_allclose(found.estimated_commands, told + moved, atol=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:.*odr. is deprecated")
 def test_pearsons_data_with_yorks_weights() -> None:
     """York, 1966: slope -.480533, intercept 5.47991; and scipy's odr."""
     x = np.array([0.0, 0.9, 1.8, 2.6, 3.3, 4.4, 5.2, 6.1, 6.5, 7.4])
@@ -444,6 +445,7 @@ def test_command_for_inverts_predict() -> None:
     np.testing.assert_allclose(near, commands[0], atol=1e-8)
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 def test_command_for_reaches_a_pose() -> None:
     """Absolute poses, asked for as turns from nominal at a rough start."""
     table = [(0, 90, 89, 0), (-425, 0, 0, 0), (-392, 0, 0, 0),
@@ -469,6 +471,7 @@ def test_command_for_reaches_a_pose() -> None:
         found.command_for(desired)
 
 
+@pytest.mark.filterwarnings("ignore:.*targets are clipped")
 def test_what_is_out_of_reach_or_beyond_the_limits_is_named() -> None:
     rng = np.random.default_rng(0)
     commands = rng.uniform(-1, 1, (12, 2))

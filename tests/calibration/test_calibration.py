@@ -224,6 +224,7 @@ def test_four_postures_with_known_noise_have_a_covariance() -> None:
     assert "noise not checked: no residual" in found.summary()
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 @pytest.mark.parametrize(
     "options",
     [
@@ -316,6 +317,7 @@ def test_lack_of_fit_is_uniform_under_the_truth_and_tiny_under_an_outlier() -> N
 # -- the inverse -----------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 @given(st.integers(1, 4), seeds)
 def test_command_for_inverts_predict(n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -329,6 +331,7 @@ def test_command_for_inverts_predict(n: int, seed: int) -> None:
     assert found.command_for(wanted[0, 0]).shape == (n,)
 
 
+@pytest.mark.filterwarnings("ignore:.*targets (are clipped|is far outside)")
 def test_limits_are_kept_or_named(rng: np.random.Generator) -> None:
     commands = rng.uniform(-20, 20, (4, 3))
     found = identify(
@@ -353,6 +356,7 @@ def test_limits_are_kept_or_named(rng: np.random.Generator) -> None:
         found.command_for(wanted, [[np.nan, 1], [-1, 1], [-1, 1]])
 
 
+@pytest.mark.filterwarnings("ignore:.*targets (are clipped|is far outside)")
 @pytest.mark.parametrize(
     ("limits", "wanted", "axis"),
     [
@@ -379,6 +383,7 @@ def test_open_limits_do_not_hide_a_command_beyond_the_other_end(
 ends = st.one_of(st.just(np.inf), st.just(1e300), st.floats(0, 30))
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 @given(seeds, st.lists(st.tuples(ends, ends), min_size=3, max_size=3), st.booleans())
 def test_a_command_within_limits_is_the_inverse_or_the_axis_is_named(
     seed: int, widths: list[tuple[float, float]], at_limit: bool

@@ -92,6 +92,7 @@ def test_a_size_that_few_errors_show_is_as_wide_as_its_density(seen):
     assert stated == pytest.approx(quantile, rel=0.05)
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 def test_wrong_tolerances_cost_little():
     """Errors a fifth of the tolerances, few poses: nearly as with the right prior."""
     errors = {"stated": [], "sized": [], "right": []}

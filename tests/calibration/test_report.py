@@ -27,6 +27,7 @@ def table(path, rng, gain=0.71, rows=9):
     return u, y
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 def test_held_out_errors_and_leverage_are_those_of_fits_without_the_row(tmp_path, rng):
     u, y = table(tmp_path / "t.csv", rng)
     calibration = jaxcal.identify(u, y, noise_std=0.05)

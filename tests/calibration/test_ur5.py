@@ -77,6 +77,7 @@ def test_no_search_fails_with_a_vague_prior_from_afar() -> None:
         assert np.abs(found.residuals).max() < 0.1
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 @pytest.mark.parametrize("noise_std", [0.1, None])
 @pytest.mark.parametrize("count", [12, 20, 40])
 def test_without_any_prior_the_search_ends(count: int, noise_std: float | None) -> None:

@@ -28,6 +28,7 @@ def hooks():
     return importlib.import_module("hooks")
 
 
+@pytest.mark.filterwarnings("ignore:JAXopt is no longer maintained")
 def test_every_public_name_is_documented(hooks):
     assert [name for each in hooks.PUBLIC for name in hooks.undocumented(each)] == []
 

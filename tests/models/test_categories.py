@@ -50,6 +50,7 @@ def test_features_span_what_formulaic_makes(formula):
     assert rank == np.linalg.matrix_rank(np.hstack([features, others]))
 
 
+@pytest.mark.filterwarnings("ignore:.*is ignored .not needed")
 def test_words_of_a_frame_are_chosen_from_fitted_and_predicted():
     rows = [MATERIALS.index(x) for x in TABLE.material]
     measured = 1.0 + 0.5 * TABLE.x + np.array([0.0, 2.0, -3.0])[rows]

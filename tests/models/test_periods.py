@@ -74,6 +74,7 @@ def test_everything_is_as_if_the_circle_were_cut_elsewhere(seed):
     assert np.abs(command - np.radians(180.0)) < np.radians(15.0)
 
 
+@pytest.mark.filterwarnings("ignore:f is not smooth")
 def test_without_the_period_the_same_readings_do_not_fit():
     _, u, y = readings(0.0, 3)
     blind = FromFunction(seen, [1.0, 0.1, 0.1])
