@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import (
     Array,
-    array_of,
     axis_names,
     in_words,
     levels,
@@ -24,13 +23,12 @@ from jaxcal.checks import (
 from jaxcal.models.differences import STENCILS, Differences, combined, look
 from jaxcal.models.model import (
     Fitting,
-    Model,
+    FunctionModel,
     Theta,
     as_commands,
     as_parameters,
     by_name,
     checked_periods,
-    parameter_names,
 )
 from jaxcal.models.runs import CommandLine, Runs
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
@@ -75,7 +73,7 @@ class FunctionFitting(Fitting):
         }
 
 
-class FromFunction(Model):
+class FromFunction(FunctionModel):
     """``y = f(u, theta)`` of any function or program; derivatives by differences.
 
     Steps are chosen from the noise of f at the first derivative; ``differences`` lists
@@ -100,8 +98,7 @@ class FromFunction(Model):
     """
 
     title = "of a function"
-    names: tuple[str, ...]
-    nominal: Array
+    _kind_written, _counted_by = "function", "inputs"
 
     def __init__(
         self,
@@ -118,13 +115,9 @@ class FromFunction(Model):
         processes: int | Executor = 1,
         quiet: bool = False,
     ) -> None:
-        self.nominal = array_of("nominal", nominal, "p")
-        if not len(self.nominal):
-            raise ValueError("nominal must hold at least one parameter, got none")
-        self.names = parameter_names(names, len(self.nominal))
+        super().__init__(nominal, names, periods)
         self.scale = self._scale(scale)
         self._stated = scale is not None
-        self._num_inputs: int | None = None
         self.inputs = ()  # names of the commands, where they have some
         if isinstance(inputs, int):
             self._num_inputs = whole_number("inputs", inputs, 1)
@@ -140,7 +133,7 @@ class FromFunction(Model):
             f = CommandLine(f, (*self.inputs, *self.names))
         noise = as_noise(noise)
         require_kind("prior", prior, Prior)
-        self._noise, self._prior, self._given_periods = noise, prior, periods
+        self._noise, self._prior = noise, prior
         if not isinstance(processes, Executor):
             processes = whole_number("processes", processes, 1)
         self._runs = Runs(f, bool(batch), processes, quiet)
@@ -152,26 +145,9 @@ class FromFunction(Model):
     # -- shapes ------------------------------------------------------------------------
 
     @property
-    def num_inputs(self) -> int:
-        """n."""
-        if self._num_inputs is None:
-            raise ValueError(
-                "give inputs: FromFunction(f, nominal, inputs=...). Before the first "
-                "commands this model does not know num_inputs"
-            )
-        return self._num_inputs
-
-    @property
     def num_outputs(self) -> int:
         """q; 0 before the first run."""
         return self._runs.num_outputs or 0
-
-    @property
-    def periods(self) -> Array | None:
-        """(q,) of readings that wrap."""
-        if self._given_periods is None or not self.num_outputs:
-            return None
-        return checked_periods(self._given_periods, self.num_outputs)
 
     # -- f and its derivatives ---------------------------------------------------------
 
@@ -210,11 +186,6 @@ class FromFunction(Model):
     def default_noise(self) -> Noise | None:
         """The noise as given."""
         return self._noise
-
-    def to_dict(self) -> dict[str, Any]:
-        """The function itself cannot be written."""
-        names, nominal = list(self.names), self.nominal.tolist()
-        return {"kind": "function", "names": names, "nominal": nominal}
 
     def close(self) -> None:
         """End the processes that run f, if they are not yours; they start if asked."""

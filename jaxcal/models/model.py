@@ -289,6 +289,51 @@ class Model(abc.ABC):
         return type(self).__name__
 
 
+class FunctionModel(Model):
+    """A model of a caller's function, whose numbers n and q the first commands show."""
+
+    names: tuple[str, ...]
+    nominal: Array
+    _kind_written: ClassVar[str]  # in files
+    _counted_by: ClassVar[str]  # the argument that gives n
+
+    def __init__(
+        self,
+        nominal: ArrayLike,
+        names: Sequence[str] | None,
+        periods: ArrayLike | None,
+    ) -> None:
+        self.nominal = array_of("nominal", nominal, "p")
+        if not len(self.nominal):
+            raise ValueError("nominal must hold at least one parameter, got none")
+        self.names = parameter_names(names, len(self.nominal))
+        self._num_inputs: int | None = None
+        self._given_periods = periods
+
+    @property
+    def num_inputs(self) -> int:
+        """n."""
+        if self._num_inputs is None:
+            made = f"{type(self).__name__}(f, nominal, {self._counted_by}=...)"
+            raise ValueError(
+                f"give {self._counted_by}: {made}. Before the first commands this "
+                "model does not know num_inputs"
+            )
+        return self._num_inputs
+
+    @property
+    def periods(self) -> Array | None:
+        """(q,) of readings that wrap."""
+        if self._given_periods is None or not self.num_outputs:
+            return None
+        return checked_periods(self._given_periods, self.num_outputs)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The function itself cannot be written."""
+        names, nominal = list(self.names), self.nominal.tolist()
+        return {"kind": self._kind_written, "names": names, "nominal": nominal}
+
+
 class _Adapter(Model):
     """A model of another class, with the defaults for what it has not."""
 
