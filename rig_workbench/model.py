@@ -48,7 +48,7 @@ class DeviceModel:
         known = (self.prior or self.model.default_prior()).resolve(self.model)
         deviation = np.random.default_rng(seed).normal(size=len(known.mean))
         with np.errstate(divide="ignore"):
-            std = np.diagonal(known.precision) ** -0.5
+            std = known.precisions**-0.5
         std = np.where(np.isfinite(std), std, 0.05 * np.maximum(1.0, abs(known.mean)))
         return known.mean + np.where(known.free, std * deviation, 0.0)
 

@@ -161,7 +161,7 @@ def _drawn(
             )
         return drawn, np.zeros(p), prior
     resolved = (model.default_prior() if prior is None else prior).resolve(model)
-    precision = np.diag(resolved.precision)
+    precision = resolved.precisions
     unknown = resolved.free & (precision == 0.0)
     if unknown.any():
         named = ", ".join(np.array(model.names)[unknown])

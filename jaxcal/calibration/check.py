@@ -14,8 +14,7 @@ from jaxcal.calibration.pairing import of_new_readings
 from jaxcal.checks import Array, Indices, Mask, array_of, by_unit, whole_number
 from jaxcal.files import AnyPath
 from jaxcal.information.blocks import without
-from jaxcal.models.model import recorded
-from jaxcal.models.recording import Recording
+from jaxcal.models.model import Recording, recorded
 from jaxcal.tables import say_order
 
 _ALARMS = 0.05  # share of false alarms

@@ -32,8 +32,7 @@ from jaxcal.checks import (
 )
 from jaxcal.files import AnyPath
 from jaxcal.models.linear import Affine
-from jaxcal.models.model import Model, recorded
-from jaxcal.models.recording import Recording
+from jaxcal.models.model import Model, Recording, recorded
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
 from jaxcal.tables import (
     COMMANDS,

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from jaxcal.arguments import several
 from jaxcal.checks import Array, one_of
-from jaxcal.models.model import Model, as_model
-from jaxcal.models.recording import Recording
+from jaxcal.models.model import Model, Recording, as_model
 from jaxcal.tables import COMMANDS, Table, say
 
 if TYPE_CHECKING:

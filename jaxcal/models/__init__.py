@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.models.identifiability import Identifiability, identifiability
 from jaxcal.models.linear import Affine, Linear, Polynomial
-from jaxcal.models.model import Model, from_dict
-from jaxcal.models.recording import Recording
+from jaxcal.models.model import Model, Recording, from_dict
 from jaxcal.models.uncertainty import Noise, Prior
 
 if TYPE_CHECKING:

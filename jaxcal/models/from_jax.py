@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.checks import Array, numbers, table, whole_number
+from jaxcal.checks import Array, table, whole_number
 from jaxcal.extras import needs
 from jaxcal.models.model import (
-    Model,
+    FunctionModel,
     Theta,
     as_commands,
     as_parameters,
     checked_periods,
-    parameter_names,
 )
 
 
-class FromJax(Model):
+class FromJax(FunctionModel):
     """``y = f(u, theta)`` of one command; values and derivatives in float64 by JAX.
 
     The first call with a number of commands compiles f for it; the caller's JAX
@@ -37,8 +36,7 @@ class FromJax(Model):
         periods: (q,) or one for all readings that wrap: 360 degrees, inf of others.
     """
 
-    names: tuple[str, ...]
-    nominal: Array
+    _kind_written, _counted_by = "jax", "num_inputs"
 
     def __init__(
         self,
@@ -51,36 +49,16 @@ class FromJax(Model):
         if not callable(f):
             raise ValueError(f"f must be a function of (u, theta), got {f!r}")
         self.f = f
-        self.nominal = numbers("nominal", nominal)
-        if self.nominal.ndim != 1 or not len(self.nominal):
-            raise ValueError(f"nominal must have shape (p,), got {self.nominal.shape}")
-        self.names = parameter_names(names, len(self.nominal))
-        self._num_inputs: int | None = None
-        self._periods = None if periods is None else np.asarray(periods)
+        super().__init__(nominal, names, periods)
         with needs("policy", "FromJax"):
             import jax  # noqa: F401  # refused here where it is not installed
         if num_inputs is not None:
             self._trace(whole_number("num_inputs", num_inputs, 1))
 
     @property
-    def num_inputs(self) -> int:
-        """n."""
-        if self._num_inputs is None:
-            raise ValueError(
-                "give num_inputs: FromJax(f, nominal, num_inputs=...). Before the "
-                "first commands this model does not know it"
-            )
-        return self._num_inputs
-
-    @property
     def num_outputs(self) -> int:
         """m; 0 before the first commands."""
         return self._num_outputs if self.num_inputs else 0
-
-    @property
-    def periods(self) -> Array | None:
-        """(q,) of readings that wrap."""
-        return self._periods
 
     def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """Outputs (N, q) at commands (N, n)."""
@@ -99,11 +77,6 @@ class FromJax(Model):
         import jax.numpy as jnp
 
         return jnp.atleast_1d(self.f(command, parameters))
-
-    def to_dict(self) -> dict[str, Any]:
-        """The function itself cannot be written."""
-        names, nominal = list(self.names), self.nominal.tolist()
-        return {"kind": "jax", "names": names, "nominal": nominal}
 
     def _trace(self, num_inputs: int) -> None:
         """Find q, and whether JAX can follow f at all."""
@@ -142,8 +115,8 @@ class FromJax(Model):
                 f"{type(result).__name__ if shape is None else shape}"
             )
         count = shape[0] if shape else 1
-        if self._periods is not None:
-            self._periods = checked_periods(self._periods, count)
+        if self._given_periods is not None:
+            checked_periods(self._given_periods, count)
         self._num_inputs, self._num_outputs = num_inputs, count
 
     @functools.cached_property

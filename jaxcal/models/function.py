@@ -13,25 +13,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import (
     Array,
-    array_of,
     axis_names,
     in_words,
     levels,
     require_kind,
-    seconds,
     table,
     whole_number,
 )
 from jaxcal.models.differences import STENCILS, Differences, combined, look
 from jaxcal.models.model import (
     Fitting,
-    Model,
+    FunctionModel,
     Theta,
     as_commands,
     as_parameters,
     by_name,
     checked_periods,
-    parameter_names,
 )
 from jaxcal.models.runs import CommandLine, Runs
 from jaxcal.models.uncertainty import Noise, Prior, as_noise
@@ -76,7 +73,7 @@ class FunctionFitting(Fitting):
         }
 
 
-class FromFunction(Model):
+class FromFunction(FunctionModel):
     """``y = f(u, theta)`` of any function or program; derivatives by differences.
 
     Steps are chosen from the noise of f at the first derivative; ``differences`` lists
@@ -97,13 +94,11 @@ class FromFunction(Model):
         periods: (q,) or one for all readings that wrap: 360 degrees, inf of others.
         processes: number that run f; f must then be importable. Or an executor of
             ``concurrent.futures``, such as a cluster's, which you close.
-        timeout: seconds after which a run of a program has failed.
         quiet: no progress on standard error.
     """
 
     title = "of a function"
-    names: tuple[str, ...]
-    nominal: Array
+    _kind_written, _counted_by = "function", "inputs"
 
     def __init__(
         self,
@@ -118,16 +113,11 @@ class FromFunction(Model):
         prior: Prior | None = None,
         periods: ArrayLike | None = None,
         processes: int | Executor = 1,
-        timeout: float | None = None,
         quiet: bool = False,
     ) -> None:
-        self.nominal = array_of("nominal", nominal, "p")
-        if not len(self.nominal):
-            raise ValueError("nominal must hold at least one parameter, got none")
-        self.names = parameter_names(names, len(self.nominal))
+        super().__init__(nominal, names, periods)
         self.scale = self._scale(scale)
         self._stated = scale is not None
-        self._num_inputs: int | None = None
         self.inputs = ()  # names of the commands, where they have some
         if isinstance(inputs, int):
             self._num_inputs = whole_number("inputs", inputs, 1)
@@ -140,13 +130,10 @@ class FromFunction(Model):
                     "a program needs inputs=[...], the names of its commands, and "
                     "takes one command at a time"
                 )
-            limit = None if timeout is None else seconds("timeout", timeout)
-            f = CommandLine(f, (*self.inputs, *self.names), limit)
-        elif timeout is not None:
-            raise ValueError("timeout needs a program; f is a function")
+            f = CommandLine(f, (*self.inputs, *self.names))
         noise = as_noise(noise)
         require_kind("prior", prior, Prior)
-        self._noise, self._prior, self._given_periods = noise, prior, periods
+        self._noise, self._prior = noise, prior
         if not isinstance(processes, Executor):
             processes = whole_number("processes", processes, 1)
         self._runs = Runs(f, bool(batch), processes, quiet)
@@ -158,40 +145,23 @@ class FromFunction(Model):
     # -- shapes ------------------------------------------------------------------------
 
     @property
-    def num_inputs(self) -> int:
-        """n."""
-        if self._num_inputs is None:
-            raise ValueError(
-                "give inputs: FromFunction(f, nominal, inputs=...). Before the first "
-                "commands this model does not know num_inputs"
-            )
-        return self._num_inputs
-
-    @property
     def num_outputs(self) -> int:
         """q; 0 before the first run."""
         return self._runs.num_outputs or 0
-
-    @property
-    def periods(self) -> Array | None:
-        """(q,) of readings that wrap."""
-        if self._given_periods is None or not self.num_outputs:
-            return None
-        return checked_periods(self._given_periods, self.num_outputs)
 
     # -- f and its derivatives ---------------------------------------------------------
 
     def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """Outputs (N, q) at commands (N, n), NaN where f fails."""
-        return self._remembered(self._values, commands, parameters)
+        return self._remembered("values", commands, parameters)
 
     def jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, p), NaN where f fails."""
-        return self._remembered(self._by_parameters, commands, parameters)
+        return self._remembered("parameters", commands, parameters)
 
     def command_jacobian(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         """(N, q, n), NaN where f fails."""
-        return self._remembered(self._by_commands, commands, parameters)
+        return self._remembered("commands", commands, parameters)
 
     def differences(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
@@ -216,11 +186,6 @@ class FromFunction(Model):
     def default_noise(self) -> Noise | None:
         """The noise as given."""
         return self._noise
-
-    def to_dict(self) -> dict[str, Any]:
-        """The function itself cannot be written."""
-        names, nominal = list(self.names), self.nominal.tolist()
-        return {"kind": "function", "names": names, "nominal": nominal}
 
     def close(self) -> None:
         """End the processes that run f, if they are not yours; they start if asked."""
@@ -248,33 +213,27 @@ class FromFunction(Model):
         return rows
 
     def _remembered(
-        self,
-        make: Callable[[Array, Array], Array],
-        commands: ArrayLike,
-        parameters: ArrayLike | None,
+        self, what: str, commands: ArrayLike, parameters: ArrayLike | None
     ) -> Array:
-        """(N, ...) what ``make`` makes of commands and parameters. Kept for the last
+        """(N, ...) values, or derivatives by parameters or commands. Kept for the last
         sets of parameters: by command, of a long table as a whole."""
         rows, theta = self._asked(commands), as_parameters(self, parameters)
         whole = len(rows) > _LONG
-        key = make.__name__, theta.tobytes() + (rows.tobytes() if whole else b"")
+        key = what, theta.tobytes() + (rows.tobytes() if whole else b"")
         results = self._results.pop(key, {})
         self._results[key] = results  # the newest
         while len(self._results) > 3 * _SETS:
             del self._results[next(iter(self._results))]
         if whole:
             if not results:
-                results[b""] = make(rows, theta)
+                results[b""] = self._computed(what, rows, theta)
             return results[b""]
         labels = [row.tobytes() for row in rows]
         places = {label: i for i, label in enumerate(labels) if label not in results}
         if places:
-            made = make(rows[[*places.values()]], theta)
-            results |= dict(zip(places, made, strict=True))
+            new = self._computed(what, rows[[*places.values()]], theta)
+            results |= dict(zip(places, new, strict=True))
         return np.array([results[x] for x in labels])
-
-    def _values(self, rows: Array, theta: Array) -> Array:
-        return self._run([(rows, theta)])[0]
 
     def _run(self, jobs: list[tuple[Array, Array]]) -> list[Array]:
         """(N, q) of each job."""
@@ -286,13 +245,18 @@ class FromFunction(Model):
             checked_periods(self._given_periods, self.num_outputs)
         return values
 
-    def _by_parameters(self, rows: Array, theta: Array) -> Array:
-        steps = self._steps_for("parameters", rows, theta)
+    def _computed(self, what: str, rows: Array, theta: Array) -> Array:
+        """(N, q) values, or (N, q, p) or (N, q, n) derivatives."""
+        if what == "values":
+            return self._run([(rows, theta)])[0]
+        steps = self._steps_for(what, rows, theta)
 
         def jobs(at: Array, j: int, side: str) -> list[Any]:
             offsets = STENCILS[side].offsets * steps.steps[j]
-            moved = theta + offsets[:, None] * np.eye(len(theta))[j]
-            return [(at, point) for point in moved]
+            moves = offsets[:, None] * np.eye(len(steps.steps))[j]
+            if what == "commands":
+                return [(at + move, theta) for move in moves]
+            return [(at, theta + move) for move in moves]
 
         pairs = enumerate(steps.sides)
         values = self._run([job for j, side in pairs for job in jobs(rows, j, side)])
@@ -300,7 +264,7 @@ class FromFunction(Model):
         failed = np.asarray(np.isnan(np.array(values)).any(axis=(0, 2)))
         if failed.any():  # at an edge of what f takes?
             failed[failed] = ~np.isnan(self.predict(rows[failed], theta)).any(axis=1)
-            for j in range(len(theta)):
+            for j in range(len(steps.steps)):
                 its = values[4 * j : 4 * j + 4]
                 for side in ("forward", "backward"):
                     lost = failed & np.isnan(np.array(its)).any(axis=(0, 2))
@@ -310,17 +274,6 @@ class FromFunction(Model):
                             old[lost] = new
                         sides[j, lost] = side
         return self._slopes(steps, rows, values, sides)
-
-    def _by_commands(self, rows: Array, theta: Array) -> Array:
-        steps = self._steps_for("commands", rows, theta)
-        offsets = np.array([STENCILS[side].offsets for side in steps.sides])
-        offsets = offsets * steps.steps[:, None]
-        moves = np.eye(len(offsets))[:, None] * offsets[..., None]  # (n, 4, n)
-        points = rows + moves.reshape(-1, 1, rows.shape[1])
-        values = self._run([(points.reshape(-1, rows.shape[1]), theta)])[0]
-        values = values.reshape(len(points), len(rows), -1)
-        sides = np.array([steps.sides] * len(rows), dtype=object).T
-        return self._slopes(steps, rows, [*values], sides)
 
     def _slopes(
         self,

@@ -94,7 +94,7 @@ def identifiability(
     asked = np.ones(model.num_parameters, dtype=np.bool_)
     held: Sequence[str] = ()
     if resolved is not None:
-        rows = np.vstack([rows, np.sqrt(resolved.precision)])
+        rows = np.vstack([rows, np.diag(np.sqrt(resolved.precisions))])
         asked &= resolved.free
     elif parameters is None:
         held = model.default_prior().fixed

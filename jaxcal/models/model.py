@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 import functools
 import os
 import sys
@@ -24,7 +25,6 @@ from jaxcal.checks import (
     require_none,
 )
 from jaxcal.extras import installed
-from jaxcal.models.recording import Recording
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.tables import COMMANDS, header_of, of_frame
 
@@ -35,6 +35,32 @@ _NOTHING_KNOWN = Prior(np.inf)
 _GROUP = "jaxcal.models"  # entry points by which others, as jaxcal.arms, add kinds
 _KINDS = {"affine": "Affine", "linear": "Linear", "polynomial": "Polynomial"}
 _UNWRITTEN = ("function", "jax")  # kinds that hold a function
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """A recording of an arm that rested at each of several postures, as commands.
+
+    Joints are found by name; readings are the mean over each rest of the bag's points
+    or poses (geometry_msgs PointStamped, PoseStamped; of a board in the camera too),
+    lengths of a wire (sensor_msgs Range, std_msgs Float64), accelerations (sensor_msgs
+    Imu), wrenches (WrenchStamped), in metres, radians, newtons; contacts need none.
+    """
+
+    # rosbag2 folder or MCAP file (extra ``ros``), or the folder of a LeRobot dataset
+    # (extra ``lerobot``), whose joints are in degrees.
+    path: str | os.PathLike[str]
+    which: Sequence[int] | None = None  # socket, plane or wire of each rest, in order
+    seconds: float = 0.5  # shortest rest
+    # Degrees (or units of length) in which a resting joint stays. None: 0.05, or eight
+    # times what the joint's readings jitter by.
+    within: float | None = None
+    # LeRobot's calibration file of an arm whose dataset is in -100 to 100 of each
+    # motor's range instead of degrees.
+    servos: str | os.PathLike[str] | None = None
+    # Of joints recorded under another name: {"Rotation": "shoulder_pan"}.
+    names: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    topic: str = ""  # of the readings, if the bag has several of this type
 
 
 class ErrorGroups(NamedTuple):
@@ -261,6 +287,51 @@ class Model(abc.ABC):
     @property
     def _kind(self) -> str:
         return type(self).__name__
+
+
+class FunctionModel(Model):
+    """A model of a caller's function, whose numbers n and q the first commands show."""
+
+    names: tuple[str, ...]
+    nominal: Array
+    _kind_written: ClassVar[str]  # in files
+    _counted_by: ClassVar[str]  # the argument that gives n
+
+    def __init__(
+        self,
+        nominal: ArrayLike,
+        names: Sequence[str] | None,
+        periods: ArrayLike | None,
+    ) -> None:
+        self.nominal = array_of("nominal", nominal, "p")
+        if not len(self.nominal):
+            raise ValueError("nominal must hold at least one parameter, got none")
+        self.names = parameter_names(names, len(self.nominal))
+        self._num_inputs: int | None = None
+        self._given_periods = periods
+
+    @property
+    def num_inputs(self) -> int:
+        """n."""
+        if self._num_inputs is None:
+            made = f"{type(self).__name__}(f, nominal, {self._counted_by}=...)"
+            raise ValueError(
+                f"give {self._counted_by}: {made}. Before the first commands this "
+                "model does not know num_inputs"
+            )
+        return self._num_inputs
+
+    @property
+    def periods(self) -> Array | None:
+        """(q,) of readings that wrap."""
+        if self._given_periods is None or not self.num_outputs:
+            return None
+        return checked_periods(self._given_periods, self.num_outputs)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The function itself cannot be written."""
+        names, nominal = list(self.names), self.nominal.tolist()
+        return {"kind": self._kind_written, "names": names, "nominal": nominal}
 
 
 class _Adapter(Model):

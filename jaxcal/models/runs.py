@@ -36,13 +36,11 @@ class _RunError(Exception):
 class CommandLine:
     """A program that prints the readings of one command: its ``words``, in which
     ``{name}`` stands for a value, of ``names`` of commands, then parameters; one text
-    is split as a shell does. A run fails after ``timeout`` seconds."""
+    is split as a shell does."""
 
-    def __init__(
-        self, words: str | Sequence[str], names: Sequence[str], timeout: float | None
-    ) -> None:
+    def __init__(self, words: str | Sequence[str], names: Sequence[str]) -> None:
         self.words = tuple(shlex.split(words) if isinstance(words, str) else words)
-        self.names, self.timeout = tuple(names), timeout
+        self.names = tuple(names)
         if not self.words or not all(isinstance(word, str) for word in self.words):
             raise ValueError(f"f must be a program with its arguments, got {words!r}")
         if shutil.which(self.words[0]) is None:
@@ -58,9 +56,7 @@ class CommandLine:
         line = list(self.words)
         for name, value in zip(self.names, [*command, *parameters], strict=True):
             line = [word.replace(f"{{{name}}}", repr(float(value))) for word in line]
-        done = subprocess.run(
-            line, capture_output=True, text=True, timeout=self.timeout, check=False
-        )
+        done = subprocess.run(line, capture_output=True, text=True)
         if done.returncode:
             last = (done.stderr.strip().splitlines() or [""])[-1]
             raise _RunError(f"exit code {done.returncode}: {last}"[:200])

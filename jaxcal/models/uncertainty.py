@@ -33,11 +33,6 @@ class ResolvedPrior:
     precisions: Array  # (p,) inverse variances, 0 where nothing is known
     free: NDArray[np.bool_]  # (p,) False: held at the mean
 
-    @property
-    def precision(self) -> Array:
-        """(p, p) diagonal."""
-        return np.diag(self.precisions)
-
 
 @dataclasses.dataclass(frozen=True)
 class Prior:

@@ -82,11 +82,6 @@ def _vote(cell: str) -> str | None:
     return None if _THOUSANDS.fullmatch(cell) else last
 
 
-def numbers_of(cells: Sequence[str], mark: str = ".") -> list[float | None]:
-    """Each cell as a number, NaN where it is empty, None where it holds none."""
-    return [_number(cell, mark) for cell in cells]
-
-
 def ambiguous(cells: Sequence[str], mark: str, decided: bool) -> int | None:
     """The place of the first cell that could be two numbers."""
     marked = [i for i, cell in enumerate(cells) if cell[-4:-3] in (".", ",")]
@@ -113,7 +108,8 @@ def _plain(cell: str) -> str:
     return cell
 
 
-def _number(cell: str, mark: str) -> float | None:
+def number_of(cell: str, mark: str = ".") -> float | None:
+    """A cell as a number, NaN where it is empty, None where it holds none."""
     if mark == "." and (number := _float(cell)) is not None:
         return number
     if cell.casefold() in _MISSING:

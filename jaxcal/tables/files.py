@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.checks import axis_letter
-from jaxcal.tables.cells import UNIT, decimal_mark, is_number, numbers_of
+from jaxcal.tables.cells import UNIT, decimal_mark, is_number, number_of
 from jaxcal.tables.decisions import say
 from jaxcal.tables.frames import table_of_frame
 from jaxcal.tables.table import Table, table_of
@@ -118,7 +118,7 @@ def _require_decimals(
 
 
 def _is_plain(cell: str) -> bool:
-    return numbers_of([cell])[0] is not None and bool(cell)
+    return bool(cell) and number_of(cell) is not None
 
 
 def _unnamed(

@@ -177,7 +177,8 @@ def of_frame(
             if isinstance(column, np.ndarray) and len(column) == len(cells[0])
         }
         of_numbers = table_of(argument, numbers, range(len(cells[0])), None, row="row")
-        _say_unread(argument, of_numbers, names, prefix, beside)
+        if spare := of_numbers.unread(names, prefix, beside):
+            say(f"{argument}: {spare}")
     table = table_of(argument, named, range(math.prod(shape)), None, row="row")
     used = None if used is None else np.asarray(used)
     values = table.columns(names, used, levels).reshape(*shape, len(names))
@@ -226,7 +227,11 @@ def names_in(
     these and ``beside`` are said."""
     header = header_of(argument, frame)
     if not header:
-        _require_no_rows_of(argument, frame, wanted, prefix)
+        rows = _rows_of(frame)
+        if rows and None not in columns_by_name(wanted, rows, prefix):
+            raise ValueError(
+                f"{argument}: {', '.join(rows)} are names of rows; transpose it (.T)"
+            )
         return None
     try:
         names = columns_by_name(wanted, header, prefix)
@@ -238,31 +243,10 @@ def names_in(
             f"{wanted[names.index(None)]!r} is missing (columns: {', '.join(header)})"
         )
     if beside is not None:
-        _say_unread(argument, table_of_frame(argument, frame), names, prefix, beside)
+        spare = table_of_frame(argument, frame).unread(names, prefix, beside)
+        if spare:
+            say(f"{argument}: {spare}")
     return tuple(names)
-
-
-def _say_unread(
-    argument: str,
-    table: Table,
-    names: Sequence[str],
-    prefix: str,
-    beside: Collection[str],
-) -> None:
-    """Say the columns of numbers of a table that are neither these nor ``beside``."""
-    if spare := table.unread(names, prefix, beside):
-        say(f"{argument}: {spare}")
-
-
-def _require_no_rows_of(
-    argument: str, frame: Any, wanted: Sequence[str], prefix: str
-) -> None:
-    """Refuse a frame, or an array of xarray, whose rows have the columns' names."""
-    rows = _rows_of(frame)
-    if rows and None not in columns_by_name(wanted, rows, prefix):
-        raise ValueError(
-            f"{argument}: {', '.join(rows)} are names of rows; transpose it (.T)"
-        )
 
 
 def _rows_of(frame: Any) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxcal.checks import Array, Mask
-from jaxcal.tables.cells import ambiguous, decimal_mark, numbers_of, truths_of
+from jaxcal.tables.cells import ambiguous, decimal_mark, number_of, truths_of
 from jaxcal.tables.decisions import (
     AVAILABLE,
     COMMANDS,
@@ -319,7 +319,7 @@ def table_of(
             numeric[name] = cells
             continue
         point, decided = mark or decimal_mark(cells, True)
-        numbers = numbers_of(cells, point)
+        numbers = [number_of(cell, point) for cell in cells]
         if (place := ambiguous(cells, point, decided)) is not None:
             cell = cells[place]
             plain = cell.replace(",", "").replace(".", "")
@@ -364,7 +364,7 @@ def _require_numbers(
     table: Table, name: str, cells: Sequence[str], numbers: Collection[Any] = ()
 ) -> NoReturn:
     """Refuse a column of cells by the first that is no number."""
-    numbers = numbers or numbers_of(cells)
+    numbers = numbers or [number_of(cell) for cell in cells]
     for line, cell, number in zip(table.lines, cells, numbers, strict=True):
         if number is None:
             raise ValueError(

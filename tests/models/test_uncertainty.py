@@ -20,14 +20,14 @@ def test_names_that_are_left_out_are_unknown_and_stay_nominal():
     prior = Prior({"a11": 0.5, "b2": 2.0}, mean={"b1": 3.0}, fixed=["a21"])
     resolved = prior.resolve(MODEL)
     np.testing.assert_array_equal(resolved.mean, [1.0, 0.0, 3.0, 0.0])
-    np.testing.assert_array_equal(resolved.precision, np.diag([4.0, 0.0, 0.0, 0.25]))
+    np.testing.assert_array_equal(resolved.precisions, [4.0, 0.0, 0.0, 0.25])
     np.testing.assert_array_equal(resolved.free, [True, False, True, True])
 
 
 def test_one_number_and_a_row_of_them():
-    assert not jaxcal.Prior(np.inf).resolve(MODEL).precision.any()
+    assert not jaxcal.Prior(np.inf).resolve(MODEL).precisions.any()
     resolved = Prior([1.0, 2.0, np.inf, 4.0], mean=[1.0, 2.0, 3.0, 4.0]).resolve(MODEL)
-    np.testing.assert_array_equal(np.diag(resolved.precision), [1, 0.25, 0, 1 / 16])
+    np.testing.assert_array_equal(resolved.precisions, [1, 0.25, 0, 1 / 16])
     np.testing.assert_array_equal(resolved.mean, [1.0, 2.0, 3.0, 4.0])
 
 

@@ -293,7 +293,7 @@ def test_any_model_is_visited_as_by_brute_force(rng, model, k):
     candidates = rng.uniform(-20, 20, (8, 3))
     measured = rng.uniform(-20, 20, (7, 3))
     rows, before = (model.jacobian(c) / 0.1 for c in (candidates, measured))
-    known = model.default_prior().resolve(model).precision
+    known = np.diag(model.default_prior().resolve(model).precisions)
     known = known + np.einsum("kqa,kqb->ab", before, before)
     runs = []
     for subset in itertools.combinations(range(8), k):

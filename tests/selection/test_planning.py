@@ -386,7 +386,7 @@ def test_any_model_is_planned_as_by_brute_force(make, criterion):
         rows = np.concatenate([jacobian(measured), jacobian(candidates[list(indices)])])
         rows = rows / np.atleast_1d(noise.std)[:, None]
         information = np.einsum("kqa,kqb->ab", rows, rows)
-        information += known.precision[np.ix_(known.free, known.free)]
+        information += np.diag(known.precisions[known.free])
         cov = np.linalg.inv(information)
         if criterion == "parameters":
             return np.diagonal(cov)[asked]

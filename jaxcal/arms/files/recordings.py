@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from jaxcal.checks import Array, in_words, numbers
 from jaxcal.extras import needs
 from jaxcal.files import AnyPath, write_over
-from jaxcal.models.model import as_parameters
-from jaxcal.models.recording import Recording
+from jaxcal.models.model import Recording, as_parameters
 
 if TYPE_CHECKING:
     from jaxcal.arms.chain import SerialChain as Chain

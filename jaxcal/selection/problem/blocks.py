@@ -105,7 +105,7 @@ class _ModelBlocks(Blocks):
             self._mean = np.append(offer.parameters, unsaid)
         pairs = zip(model.names, resolved.free, strict=True)
         self.names = tuple(name for name, free in pairs if free)
-        self._precision = resolved.precision[np.ix_(resolved.free, resolved.free)]
+        self._precision = np.diag(resolved.precisions[resolved.free])
         besides = model.fitting.facts(resolved.mean)[1][:, resolved.free]
         self.root = prior_root(self._precision + besides.T @ besides)
 
@@ -208,7 +208,7 @@ def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> 
     if prior is None:
         return True
     resolved = prior.resolve(model)
-    return bool(resolved.free.all() and not resolved.precision.any())
+    return bool(resolved.free.all() and not resolved.precisions.any())
 
 
 def _checked_root(precision: ArrayLike | None, p: int) -> Array:

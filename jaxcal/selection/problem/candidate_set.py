@@ -72,7 +72,7 @@ def scenarios_of(scenarios: Any, model: Model, prior: Prior | None) -> Scenarios
 def _drawn(count: int, model: Model, prior: Prior | None) -> Array:
     """(S, p) draws from the prior; what it says nothing of stays at its mean."""
     resolved = (model.default_prior() if prior is None else prior).resolve(model)
-    precision = np.where(resolved.free, np.diagonal(resolved.precision), 0.0)
+    precision = np.where(resolved.free, resolved.precisions, 0.0)
     drawn = precision > 0.0
     if not drawn.any():
         raise ValueError(
