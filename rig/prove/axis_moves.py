@@ -23,6 +23,7 @@ CORNER_STD_DEG = 0.015  # of the mean over corners, where rotations make 0.08 de
 ROOM_DEG = 0.2  # left to a limit
 SEEN_DEG = 0.03  # the phone must turn at least this much in a whole move
 SEEN_SIGMA = 6.0
+TAKEN_UP = 0.5  # of what an axis turns for a pulse: its play was not in between
 
 
 def check_axes(run: Run, device: Device) -> list[Change]:
@@ -74,7 +75,7 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
     ordered = config.imu is None or config.is_arm
     corners = [] if ordered else axis_check.corners_of(len(config.axes))
     run.say(
-        f"axes: about {1 + 7 * len(start) + len(corners)} places; each axis first by "
+        f"axes: about {1 + 6 * len(start) + len(corners)} places; each axis first by "
         f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the measured motion "
         f"allows, at most {REACH_DEG:g} deg or mm in either direction"
     )
@@ -133,20 +134,30 @@ class _Tour:
         """How far the phone turned from the start, or the numbers changed."""
         return self.device.geometry.apart(self.base.attitude, stand.attitude)
 
-    def grow(self, j: int, unit: bool, samples: int = 0) -> tuple[int, int]:
-        """Move an axis further and further; pulses of the last two places."""
+    def grow(self, j: int, unit: bool, samples: int = 0) -> list[tuple[int, Stand]]:
+        """Move an axis further and further; pulses and the places, from the start."""
         config, geometry = self.run.config, self.device.geometry
         reach = self.device.proof.renew(j, unit)
-        furthest, counts = config.axes[j].to_pulses(REACH_DEG), [0]
+        furthest, places = config.axes[j].to_pulses(REACH_DEG), [(0, self.base)]
         way = int(np.sign(furthest))
         while True:
             count = reach.pulses(furthest, REACH_DEG * geometry.scale)
-            if count <= FAR_ENOUGH * counts[-1]:
-                return way * counts[-2], way * counts[-1]
+            if count <= FAR_ENOUGH * abs(places[-1][0]):
+                return places
             name = f"{config.axis_names[j]}:plus"
             stand = self.visit(name, {j: way * count}, samples)
             reach.saw(count, self.turned(stand), self.noise)
-            counts.append(count)
+            places.append((way * count, stand))
+
+    def taken_up(self, places: list[tuple[int, Stand]]) -> bool:
+        """Whether an axis had its play taken up at the last two of its places: it
+        turned the phone on the way to the first of them as it did between them."""
+        if len(places) < 3 or 2 * abs(places[-2][0]) > abs(places[-1][0]):
+            return False
+        pulses = [abs(count) for count, _ in places[-3:]]
+        turned = [self.turned(stand) for _, stand in places[-3:]]
+        before, between = np.diff(turned) / np.diff(pulses)
+        return bool(before > TAKEN_UP * between)
 
     def prove_unit(self) -> None:
         """Short moves that tell degrees of the phone from radians."""
@@ -157,7 +168,7 @@ class _Tour:
         )
         ratios = []
         for j, axis in enumerate(config.axes):
-            _, far = self.grow(j, False, 4 * config.settle.samples)
+            far, _ = self.grow(j, False, 4 * config.settle.samples)[-1]
             turned = self.turned(self.stands[f"{axis.name}:plus"])
             told = self.device.drives[j].pulses_per_rev() or axis.pulses_per_rev
             geared = told / axis.pulses_per_rev
@@ -168,8 +179,8 @@ class _Tour:
     def measure_axis(self, j: int) -> tuple[int, float]:
         """Places of one axis, both ways; pulses of the furthest, and what it turned."""
         axis, geometry = self.run.config.axes[j], self.device.geometry
-        look, far = self.grow(j, True)
-        plus = self.stands[f"{axis.name}:plus"]
+        places = self.grow(j, True)
+        far, plus = places[-1]
         turned = self.turned(plus)
         commanded = abs(axis.to_deg(far))
         least = SEEN_SIGMA * self.base.std_deg / plus.samples**0.5
@@ -179,8 +190,12 @@ class _Tour:
                 f"of {axis.name}, and {geometry.told} {turned:.3g}. {BLIND}"
             )
         # Up to its place its play is taken up on one side, down to it on the other.
-        near = look if 2 * abs(look) <= abs(far) else far // 4
-        for name, count in ("back", 0), ("minus", -far), ("look", near), ("plus", far):
+        more = [("back", 0), ("minus", -far)]
+        if self.taken_up(places):
+            self.stands[f"{axis.name}:look"] = places[-2][1]
+        else:
+            more += [("look", far // 4), ("plus", far)]
+        for name, count in more:
             self.visit(f"{axis.name}:{name}", {j: count})
         move(self.device, Posture(axis.name, self.start))
         self.run.say(

@@ -21,6 +21,7 @@ from rig.prove.axis_check import (
     find,
     proposals,
 )  # fmt: skip
+from rig.prove.axis_moves import _Tour
 from rig.readings.attitude import angle_between_deg, euler_to_matrix
 
 CONFIG = fast_config()
@@ -195,3 +196,13 @@ def test_the_drives_word_goes_before_the_measured_ratio():
     keys = {change.key: change.new for change in proposals(CONFIG, found, [None] * 3)}
     for name in AXIS_NAMES:
         assert keys[f"axes.{name}.reduction"] == pytest.approx(4.0, rel=2e-3)
+
+
+@pytest.mark.parametrize(("play", "taken"), [(0, 1), (0.2, 1), (0.7, 0), (1.5, 0)])
+def test_places_on_the_way_out_count_where_play_was_taken_up_at_both(play, taken):
+    tour = object.__new__(_Tour)
+    tour.turned = lambda turned: turned  # a place is how far the phone turned
+    places = [(-at, max(0.0, at - 1000 * play)) for at in (0, 90, 270, 800, 3000)]
+    assert tour.taken_up(places) is bool(taken)
+    assert not tour.taken_up(places[:2])
+    assert not tour.taken_up([*places[:-1], (-1500, 1.0)])  # hardly further
