@@ -338,6 +338,7 @@ def test_commands_that_are_exact_in_some_rows_stay_there() -> None:
 # -- uncertainty -----------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options",

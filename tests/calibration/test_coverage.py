@@ -147,6 +147,7 @@ CELLS = [
 ]  # fmt: skip
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind"), CELLS)
 def test_intervals_hold_the_truth_and_predictions_err_as_stated(name, kind):

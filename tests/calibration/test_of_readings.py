@@ -93,6 +93,7 @@ def test_the_pieces_hold_the_command_as_often_as_promised():
     assert unions > trials / 2
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 @pytest.mark.slow
 def test_several_inputs_have_first_order_uncertainty_that_holds():
     rng, trials = np.random.default_rng(9), 300

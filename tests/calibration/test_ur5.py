@@ -39,6 +39,7 @@ def test_all_poses_leave_a_tenth_of_a_millimetre(loss: str) -> None:
     assert np.abs(back - TEST_JOINTS).max() < 0.1
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 @pytest.mark.slow
 def test_one_outlier_in_twelve_poses_is_named_and_costs_little() -> None:
     rng = np.random.default_rng(0)

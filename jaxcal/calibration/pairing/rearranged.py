@@ -343,10 +343,14 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
     if table.sensed or not poor or count > _MOST_ROWS:
         return []
     kinds = []
-    if in_order(table.commands, 0.1).any():  # as levels, of which many rows have one
+    # As levels, of which many rows have one; by chance noise is in no order.
+    commands, readings = in_order(table.commands, 0.1), in_order(table.measured, 0.7)
+    if commands.all() and readings.all():  # what depends on one command and bends
+        return []
+    if commands.any():
         code = 2.3 + float(np.log(np.arange(1, count + 1)).sum())
         kinds.append(("commands sorted", code))
-    if in_order(table.measured, 0.7).any():  # by chance noise is in no order
+    if readings.any():
         kinds.append(("readings sorted", 5.0 * np.log(count)))
     if not kinds:
         return []
