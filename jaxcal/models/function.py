@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -171,7 +170,7 @@ class FromFunction(FunctionModel):
         rows, theta = self._asked(commands), as_parameters(self, parameters)
         return self._steps_for("parameters", rows, theta)
 
-    @functools.cached_property
+    @property
     def fitting(self) -> FunctionFitting:
         return FunctionFitting(self)
 

@@ -262,7 +262,7 @@ class Model(abc.ABC):
 
     # -- what is asked of it -----------------------------------------------------------
 
-    @functools.cached_property
+    @property
     def fitting(self) -> Fitting:
         """What a fit asks of it besides f."""
         return Fitting(self)
