@@ -323,8 +323,10 @@ class FunctionModel(Model):
 
     @property
     def periods(self) -> Array | None:
-        """(q,) of readings that wrap."""
-        if self._given_periods is None or not self.num_outputs:
+        """(q,) of readings that wrap; None before the first commands."""
+        if self._given_periods is None or self._num_inputs is None:
+            return None
+        if not self.num_outputs:
             return None
         return checked_periods(self._given_periods, self.num_outputs)
 
