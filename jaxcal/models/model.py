@@ -264,7 +264,8 @@ class Model(abc.ABC):
 
     @property
     def fitting(self) -> Fitting:
-        """What a fit asks of it besides f."""
+        """What a fit asks of it besides f. A model of one's own that answers otherwise
+        returns an object of a class derived from ``jaxcal.models.model.Fitting``."""
         return Fitting(self)
 
     def blocks(self, commands: ArrayLike) -> Array:
