@@ -43,6 +43,12 @@ def test_a_selection_in_a_line_has_no_ellipse():
     assert len(axes.lines) == 2
 
 
+def test_candidates_are_drawn_where_none_is_chosen_yet(rng):
+    none = np.zeros(0, dtype=np.int64)
+    axes = plots.selection(Figure().add_subplot(), rng.random((5, 2)), none)
+    assert [len(line.get_xydata()) for line in axes.lines] == [5, 0]
+
+
 def test_axes_of_three_dimensions_need_three_columns(rng):
     axes = Figure().add_subplot(projection="3d")
     with pytest.raises(ValueError, match=r"at least 3 columns .* \(5, 2\)"):

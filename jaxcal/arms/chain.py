@@ -66,7 +66,7 @@ class SerialChain(Arm, Model):
     standing_as = late("jaxcal.arms.files.write:standing_as")
     write_servos = late("jaxcal.arms.files.recordings:write_servos")
 
-    @functools.cached_property
+    @property
     def fitting(self) -> ArmFitting:
         return ArmFitting(self)
 

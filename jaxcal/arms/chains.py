@@ -62,7 +62,7 @@ class Chains(Model):
     chains: tuple[SerialChain, ...]
     stands: tuple[tuple[int, ...], ...]
 
-    @functools.cached_property
+    @property
     def fitting(self) -> ChainsFitting:
         return ChainsFitting(self)
 

@@ -97,7 +97,7 @@ def with_levels_apart(solution: FitSolution) -> FitSolution:
 
 
 def _by_facts(solution: FitSolution) -> Array:
-    """(N, q) how far residuals are off by facts (``Model.facts``), in their noise."""
+    """(N, q) how far residuals are off by facts (``Fitting.facts``), in their noise."""
     problem = solution.problem
     if not len(solution.facts):
         return np.zeros_like(solution.white)

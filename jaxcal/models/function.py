@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
@@ -171,7 +170,7 @@ class FromFunction(FunctionModel):
         rows, theta = self._asked(commands), as_parameters(self, parameters)
         return self._steps_for("parameters", rows, theta)
 
-    @functools.cached_property
+    @property
     def fitting(self) -> FunctionFitting:
         return FunctionFitting(self)
 
@@ -251,15 +250,19 @@ class FromFunction(FunctionModel):
             return self._run([(rows, theta)])[0]
         steps = self._steps_for(what, rows, theta)
 
-        def jobs(at: Array, j: int, side: str) -> list[Any]:
-            offsets = STENCILS[side].offsets * steps.steps[j]
-            moves = offsets[:, None] * np.eye(len(steps.steps))[j]
-            if what == "commands":
-                return [(at + move, theta) for move in moves]
-            return [(at, theta + move) for move in moves]
+        def run(at: Array, directions: Iterable[tuple[int, str]]) -> list[Array]:
+            """(N, q) at four places in each direction, from its side."""
+            moves = [
+                offset * steps.steps[j] * np.eye(len(steps.steps))[j]
+                for j, side in directions
+                for offset in STENCILS[side].offsets
+            ]
+            if what == "parameters":
+                return self._run([(at, theta + move) for move in moves])
+            there = np.concatenate([at + move for move in moves])  # in one call of f
+            return np.split(self._run([(there, theta)])[0], len(moves))
 
-        pairs = enumerate(steps.sides)
-        values = self._run([job for j, side in pairs for job in jobs(rows, j, side)])
+        values = run(rows, enumerate(steps.sides))
         sides = np.array([steps.sides] * len(rows), dtype=object).T
         failed = np.asarray(np.isnan(np.array(values)).any(axis=(0, 2)))
         if failed.any():  # at an edge of what f takes?
@@ -269,7 +272,7 @@ class FromFunction(FunctionModel):
                 for side in ("forward", "backward"):
                     lost = failed & np.isnan(np.array(its)).any(axis=(0, 2))
                     if lost.any():
-                        tried = self._run(jobs(rows[lost], j, side))
+                        tried = run(rows[lost], [(j, side)])
                         for old, new in zip(its, tried, strict=True):
                             old[lost] = new
                         sides[j, lost] = side

@@ -262,9 +262,10 @@ class Model(abc.ABC):
 
     # -- what is asked of it -----------------------------------------------------------
 
-    @functools.cached_property
+    @property
     def fitting(self) -> Fitting:
-        """What a fit asks of it besides f."""
+        """What a fit asks of it besides f. A model of one's own that answers otherwise
+        returns an object of a class derived from ``jaxcal.models.model.Fitting``."""
         return Fitting(self)
 
     def blocks(self, commands: ArrayLike) -> Array:
@@ -323,8 +324,10 @@ class FunctionModel(Model):
 
     @property
     def periods(self) -> Array | None:
-        """(q,) of readings that wrap."""
-        if self._given_periods is None or not self.num_outputs:
+        """(q,) of readings that wrap; None before the first commands."""
+        if self._given_periods is None or self._num_inputs is None:
+            return None
+        if not self.num_outputs:
             return None
         return checked_periods(self._given_periods, self.num_outputs)
 

@@ -250,7 +250,10 @@ def selection(
 def _ellipsoid(axes: Any, chosen: Array, colour: str) -> None:
     """An ellipse, in 3-D axes a wire net, as far from the mean of points (K, d) as they
     are by their scatter, in root mean square; nothing of points in a plane."""
-    middle, d = chosen.mean(axis=0), chosen.shape[1]
+    d = chosen.shape[1]
+    if len(chosen) <= d:
+        return
+    middle = chosen.mean(axis=0)
     square = d / len(chosen) * (chosen - middle).T @ (chosen - middle)
     if np.linalg.matrix_rank(square) < d:
         return

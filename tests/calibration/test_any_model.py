@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import gc
 import json
 import pathlib
+import weakref
 from typing import Any
 
 import numpy as np
@@ -745,6 +748,26 @@ def test_a_model_of_ones_own_answers_for_itself(monkeypatch):
     assert anew.says == "cannot be told" and anew.power == 0.0
     with pytest.raises(ValueError, match="must be an arm, got Line"):
         calibration.to_urdf("line.urdf")
+
+
+def test_what_a_copy_of_a_model_is_asked_is_of_the_copy():
+    model = Polynomial(1, 1)
+    assert model.fitting.wrapped(np.array([[350.0]]), np.zeros((1, 1))) == 350.0
+    angle = copy.copy(model)
+    angle.periods = np.array([360.0])
+    assert angle.fitting.wrapped(np.array([[350.0]]), np.zeros((1, 1))) == -10.0
+
+
+def test_a_model_that_was_asked_goes_when_it_is_no_more_used():
+    model = FromFunction(lambda u, theta: theta * u, [1.0], inputs=1, quiet=True)
+    assert model.fitting.rounding is None
+    gone = weakref.ref(model)
+    gc.disable()
+    try:
+        del model  # and its processes with it
+        assert gone() is None
+    finally:
+        gc.enable()
 
 
 def test_seven_names_are_a_model():

@@ -95,6 +95,22 @@ def test_batch_processes_and_one_by_one_agree(tmp_path):
     assert model(decays, batch=True).predict(U[:1]).shape == (1, 1)
 
 
+def test_a_function_of_all_commands_is_called_once_for_their_derivative():
+    sizes = []
+
+    def area(u, theta):
+        sizes.append(len(u))
+        return theta * u[:, :1] * u[:, 1:]
+
+    one = FromFunction(area, [2.0], inputs=2, batch=True, quiet=True)
+    rectangles = np.array([[1.0, 3.0], [2.0, 5.0]])
+    one.command_jacobian(rectangles)  # which finds the steps
+    sizes.clear()
+    slopes = one.command_jacobian(rectangles + 0.5)[:, 0]
+    np.testing.assert_allclose(slopes, 2.0 * (rectangles[:, ::-1] + 0.5), rtol=1e-8)
+    assert sizes == [16]
+
+
 ENDS = """
 import os
 

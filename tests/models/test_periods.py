@@ -9,6 +9,7 @@ import jaxcal
 from jaxcal.models import (
     Affine,
     FromFunction,
+    FromJax,
     Position,
     Reading,
     Sensor,
@@ -146,3 +147,11 @@ def test_periods_are_checked():
     one = FromFunction(seen, [1.0, 0.1, 0.1], periods=[360.0])
     with pytest.raises(ValueError, match=r"periods must be one number or \(2,\)"):
         one.predict([[0.0]])
+
+
+@pytest.mark.parametrize("kind", [FromFunction, FromJax])
+def test_periods_are_not_known_before_the_first_commands(kind):
+    one = kind(lambda u, theta: theta * u, [2.0, 3.0], periods=360.0)
+    assert one.periods is None
+    one.predict([[1.0]])
+    np.testing.assert_array_equal(one.periods, [360.0, 360.0])

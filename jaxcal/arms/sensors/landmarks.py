@@ -84,7 +84,7 @@ class Socket(Landmarks):
 
     Contacts do not show where the arm stands, so ``base`` is held; without a known
     distance they do not show its scale, which is the prior's: a fit compares misses
-    with the size of the arm (``Model.log_size``). ``places`` are the centres (S, 3);
+    with the size of the arm (``Fitting.log_size``). ``places`` are the centres (S, 3);
     noise, the play of the ball, 0.02 % of the arm's length.
 
     Attributes:
