@@ -87,7 +87,8 @@ def fit_model(
         noise, exact = with_play(model, noise, commands, spread), True
         spread = np.zeros_like(spread)
     with_misfit = model.with_misfit() if prior is None and exact else model
-    fitted = with_misfit if model.fitting.fits_misfit else model
+    fits_misfit = with_misfit is not model and model.fitting.fits_misfit
+    fitted = with_misfit if fits_misfit else model
     scaled = prior is not None or exact  # as far as the prior wants it
     stated = prior is not None and not prior.by_data
     prior = prior or fitted.default_prior()

@@ -87,9 +87,9 @@ class FitProblem:
     def growth(self, theta: Array) -> Array | None:
         """(N, 1) by which contacts' readings are larger than at the prior's mean, up to
         ``_LARGER``, or a tool would grow without end; None: by nothing."""
-        log = self.model.fitting.log_size(self.commands, theta)
-        if log is None or self.first_log_size is None:
+        if self.first_log_size is None:
             return None
+        log = np.asarray(self.model.fitting.log_size(self.commands, theta))
         larger = np.minimum(log - self.first_log_size, _LARGER)
         return np.exp(self._zeros * larger[:, None])
 

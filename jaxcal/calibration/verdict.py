@@ -201,13 +201,13 @@ def _unknown(fit: Fit) -> Reason | None:
 def _far_off(fit: Fit) -> Reason | None:
     """Parameters whose estimates are far from where their prior, or a model's stated
     scale, has them."""
-    p = len(fit.names)
-    if fit.model.fitting.off_by is None and not fit.prior_precision.any():
+    p, off_by = len(fit.names), fit.model.fitting.off_by
+    if off_by is None and not fit.prior_precision.any():
         return None
     with np.errstate(divide="ignore"):
         expected = 1.0 / np.sqrt(fit.prior_precision[:p])
-    if fit.model.fitting.off_by is not None:
-        expected = np.minimum(expected, fit.model.fitting.off_by)
+    if off_by is not None:
+        expected = np.minimum(expected, off_by)
     away = np.abs(fit.estimate - fit.prior_mean)[:p] / expected
     far = int(away.argmax())
     if away[far] <= _FAR:
@@ -231,11 +231,9 @@ def _on_its_way(fit: Fit) -> Reason | None:
     pull = np.einsum("nqp,nq->p", rows, fit.loss_weights[:, None] * white)
     pull += fit.prior_precision * (fit.prior_mean - fit.estimate)
     step = float(np.sqrt(max(pull @ covariance @ pull, 0.0)))
-    least = _STEP
-    if (
-        fit.model.fitting.rounding is not None
-    ):  # its own noise moves the end of a search
-        share = np.asarray(fit.model.fitting.rounding) / fit.noise_std
+    least, rounding = _STEP, fit.model.fitting.rounding
+    if rounding is not None:  # its own noise moves the end of a search
+        share = np.asarray(rounding) / fit.noise_std
         least = max(least, 3.0 * float(np.sqrt(len(pull))) * float(share.max()))
     if step < least:
         return None

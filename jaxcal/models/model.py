@@ -387,7 +387,8 @@ def of_arm(model: Any, name: str) -> Any:
 
 def as_commands(model: Any, commands: ArrayLike) -> Array:
     """``commands`` as finite float64 (N, n); of a data frame the model's columns."""
-    commands = by_name(model, commands)
+    if type(commands) is not np.ndarray or commands.dtype.names:
+        commands = by_name(model, commands)
     rule = " for this model"
     return array_of("commands", commands, "N", model.num_inputs, rule=rule)
 

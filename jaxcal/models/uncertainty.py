@@ -86,7 +86,7 @@ def _by_name(
     argument: str, values: PerParameter | None, names: tuple[str, ...], default: Any
 ) -> Array:
     """(p,) ``values`` in the order of ``names``; ``default`` where they are silent."""
-    if values is not None:
+    if not (values is None or type(values) is float):
         values = by_name(argument, values)
     if values is None or isinstance(values, Mapping):
         result = np.empty(len(names))
