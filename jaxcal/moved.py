@@ -13,6 +13,7 @@ MOVED = {  # longer names first
     "jaxcal.plots.style": "jaxcal.reports.plots",
     "jaxcal.calibration.budget": "jaxcal.reports.budget",
     "jaxcal.calibration.report": "jaxcal.reports.calibration",
+    "jaxcal.commands.train_arguments": "jaxcal.commands.train_configuration",
     "jaxcal.csvtable": "jaxcal.tables",
     "jaxcal.evaluation.dataset_files": "jaxcal.evaluation.dataset",
     "jaxcal.evaluation.parameters": "jaxcal.evaluation.methods",

@@ -86,6 +86,7 @@ def test_import_costs_numpy_alone(tmp_path):
         ("jaxcal.models.sensors", "jaxcal.arms.sensors"),
         ("jaxcal.pages", "jaxcal.reports.page"),
         ("jaxcal.plots.curves", "jaxcal.reports.plots"),
+        ("jaxcal.commands.train_arguments", "jaxcal.commands.train_configuration"),
         ("jaxcal.calibration.budget", "jaxcal.reports.budget"),
         ("rig.simulator", "rig_workbench.simulator"),
         ("rig.simulator.truth", "rig_workbench.simulator.truth"),
