@@ -178,6 +178,7 @@ def test_a_users_file_imports_what_lies_beside_it(own):
     [
         (["sides"], "--with must be NAME=VALUE with NAME of sides, noise, got 'sides'"),
         (["size=3"], "got 'size=3'"),
+        (["sides=x"], "--with sides must be a number, as 5, got 'x'"),
     ],
 )
 def test_bad_options_are_refused(own, given, message):

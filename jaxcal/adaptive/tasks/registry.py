@@ -83,21 +83,28 @@ def _of_file(path: pathlib.Path) -> Any:
 def options_from(entry: Entry, given: Sequence[str]) -> dict[str, Any]:
     """Options of a task from a command line, such as ``sigma=0.05``; refused where one
     is not NAME=VALUE, or a name that the task does not have."""
-    option_names = [
-        name
+    defaults = {
+        name: parameter.default
         for name, parameter in inspect.signature(entry.make).parameters.items()
         if parameter.kind is not parameter.VAR_KEYWORD
-    ]
-    options = {}
+    }
+    options: dict[str, Any] = {}
     for text in given:
         name, equals, value = text.partition("=")
-        if not equals or name not in option_names:
+        if not equals or name not in defaults:
             raise ValueError(
-                f"--with must be NAME=VALUE with NAME of {', '.join(option_names)}, "
+                f"--with must be NAME=VALUE with NAME of {', '.join(defaults)}, "
                 f"got {text!r}"
             )
         try:
             options[name] = ast.literal_eval(value)
         except (ValueError, SyntaxError):
             options[name] = value
+        default = defaults[name]
+        if isinstance(default, int | float) and not isinstance(
+            options[name], int | float
+        ):
+            raise ValueError(
+                f"--with {name} must be a number, as {default:g}, got {value!r}"
+            )
     return options
