@@ -59,6 +59,7 @@ def test_play_is_added_to_the_noise_of_each_reading():
         jaxcal.identify(joints, measured, model=model, noise=unknown)
 
 
+@pytest.mark.filterwarnings("ignore:.*far outside the measurements")
 @pytest.mark.slow
 def test_what_is_stated_of_an_arm_with_play_is_its_error():
     ratios, explained = [], []
