@@ -15,7 +15,7 @@ from jaxcal.arms.chain_kernel import forward
 from jaxcal.arms.sensors import Reading, Sensor, Tip
 from jaxcal.arms.sensors.sensor import BASE, Readings
 from jaxcal.checks import Array, Indices, Mask, array_of, numbers
-from jaxcal.models.model import as_commands
+from jaxcal.models.model import Quantity, as_commands
 
 _T = TypeVar("_T")
 Load = tuple[int, float, tuple[float, float, float]]  # link from 1, weight, its centre
@@ -135,6 +135,23 @@ class Arm:
         tool, waves = [mounting[i] for i in self._tool], ["deg"] * self.waves.size
         table = row * len(self.joints)
         return (*table, *driven, *mounting, *tool, *self.sensor.units, *waves)
+
+    def quantities_of(self, sensor: Sensor, measured_unit: str) -> tuple[Quantity, ...]:
+        """What one of its sensors reads, "length" where the unit of that is unknown."""
+        first, *others = sensor.quantities
+        if not others and first.points == 1 and not self.sensor.joined:
+            first = first._replace(unit=measured_unit or first.unit)
+        length = self.length_unit(measured_unit) or "length"
+        return tuple(
+            quantity._replace(unit=quantity.unit.replace("length", length))
+            for quantity in (first, *others)
+        )
+
+    def length_unit(self, measured_unit: str) -> str:
+        """The unit of lengths: the readings' if they are some, a URDF file's, or ""."""
+        of_file = "m" if self.source is not None else ""
+        others = ("deg", "rad", "m/s", "g", "N", "p", "times")
+        return of_file if measured_unit.startswith(others) else measured_unit or of_file
 
     def own(self, i: int) -> slice:
         """Where what the sensor's member ``i`` has of its own is among the p."""

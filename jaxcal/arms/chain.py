@@ -331,23 +331,6 @@ class SerialChain(Arm, Model):
     def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
         return self.quantities_of(self.sensor, measured_unit)
 
-    def quantities_of(self, sensor: Sensor, measured_unit: str) -> tuple[Quantity, ...]:
-        """What one of its sensors reads, "length" where the unit of that is unknown."""
-        first, *others = sensor.quantities
-        if not others and first.points == 1 and not self.sensor.joined:
-            first = first._replace(unit=measured_unit or first.unit)
-        length = self.length_unit(measured_unit) or "length"
-        return tuple(
-            quantity._replace(unit=quantity.unit.replace("length", length))
-            for quantity in (first, *others)
-        )
-
-    def length_unit(self, measured_unit: str) -> str:
-        """The unit of lengths: the readings' if they are some, a URDF file's, or ""."""
-        of_file = "m" if self.source is not None else ""
-        others = ("deg", "rad", "m/s", "g", "N", "p", "times")
-        return of_file if measured_unit.startswith(others) else measured_unit or of_file
-
     def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         return self._reading(commands, theta).values.copy()

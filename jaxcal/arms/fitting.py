@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.arms.arm import Arm
 from jaxcal.checks import Array
 from jaxcal.late import late
 from jaxcal.models.model import ErrorGroups, Fitting, as_parameters
-
-if TYPE_CHECKING:
-    from jaxcal.arms.chain import SerialChain
-    from jaxcal.arms.chains import Chains
 
 
 class ArmFitting(Fitting):
     """What is asked of an arm with its sensor."""
 
-    model: SerialChain
+    model: Arm
 
     # Functions of the model, in modules that know it.
     anew = late("jaxcal.arms.plausible:anew", of="model")
@@ -132,8 +128,6 @@ class ArmFitting(Fitting):
 
 class ChainsFitting(Fitting):
     """What is asked of several chains: of each, in its rows."""
-
-    model: Chains
 
     prepared = late("jaxcal.arms.plausible:prepared_chains", of="model")
     verdict = late("jaxcal.arms.verdict:verdict_of_chains", of="model")

@@ -393,7 +393,7 @@ def as_commands(model: Any, commands: ArrayLike) -> Array:
     return array_of("commands", commands, "N", model.num_inputs, rule=rule)
 
 
-def as_parameters(model: Model, parameters: ArrayLike | None) -> Array:
+def as_parameters(model: Any, parameters: ArrayLike | None) -> Array:
     """``parameters`` as finite float64 (p,); the nominal ones for None."""
     if parameters is None:
         return model.nominal
