@@ -30,6 +30,7 @@ ASSIGNMENT = re.compile(
     r"\s*(?=[,;#}]|$|\s[\w-]+\s*=)"
 )
 NOTE = re.compile(r"\s*(;|//)")  # as other formats have them
+APART = re.compile(r"\s*([A-Za-z_]\w*)\s+(\"[^\"]*\"|'[^']*'|[^\s,;#]+)\s*(?:[#,].*)?")
 QUOTES = dict.fromkeys(
     map(ord, "\u201c\u201d\u201e\u201f\u2018\u2019\u201a\u00ab\u00bb"), '"'
 )
@@ -54,6 +55,7 @@ FRAMES = (  # of a map, besides its stop
     "move", "home", "hold", "enable", "alarm_reset", "comm_timeout", "limits",
     "set_zero",
 )  # fmt: skip
+KEYS = {"name", "transport", "host", "device", "parity", "echo", *RANGES, *AXIS}
 Faults = list[str]
 
 
@@ -392,7 +394,7 @@ def _added(
     if isinstance(old, dict) and isinstance(value, dict):
         for inner_key, inner_value in value.items():
             _added(root, old, inner_key, inner_value)
-    elif not old:
+    elif not old or (_out_of_range(key, old) and not _out_of_range(key, value)):
         table[key] = value
     elif key == "transport" and value != old:
         return _inner(root, "bus" if _is_transport(value) else "imu")
@@ -401,6 +403,13 @@ def _added(
             root["axes"] = [*rows_of(root.get("axes")), {key: value}]
             return _inner(root, "axes")
     return table
+
+
+def _out_of_range(key: str, value: Any) -> bool:
+    faults: Faults = []
+    if key in RANGES:
+        _number(value, 0, *RANGES[key], key, faults)
+    return bool(faults)
 
 
 def _inner(table: dict[str, Any], name: str) -> dict[str, Any]:
@@ -418,6 +427,8 @@ def _first_values(lines: Sequence[str]) -> tuple[list[tuple[str, Any]], int]:
         except (ValueError, RecursionError):
             continue
     pairs = ASSIGNMENT.findall("" if NOTE.match(lines[0]) else lines[0])
+    if not pairs and (apart := APART.fullmatch(lines[0])) and apart[1].lower() in KEYS:
+        pairs = [apart.groups()]  # the sign between them is gone
     return [(key, value.strip(" \"'\ufffd")) for key, value in pairs], 1
 
 

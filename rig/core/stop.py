@@ -11,6 +11,8 @@ from rig.drives.drive import STILL_COUNTS, Drive
 
 ROUNDS = 3  # times a stop is sent to a unit that does not acknowledge
 VERIFY_S = 3.0  # for all units together to come to rest
+MOST_TIMES = 4  # as long, where replies come so slowly that few were seen
+ENOUGH = 4  # looks at a unit that tell whether it stands
 POLL_S = 0.02
 LOOK_S = 0.1  # between two looks at drives that stand
 WENT_ON_S = 0.5  # a drive that took longer to stand is said to have gone on
@@ -80,11 +82,13 @@ def _send(pairs: Pairs) -> None:
 
 
 def _verify(pairs: Pairs) -> None:
-    """Poll until each stands, as long again while one without a motion is still to be
-    looked at; one that answers again is told to stop once more."""
+    """Poll until each stands, longer while one without a motion is still to be looked
+    at or a slow line has shown too little; one that answers again is told to stop once
+    more."""
     begun = time.monotonic()
-    end = begun + VERIFY_S
     before: dict[int, int] = {}
+    moved_s = dict.fromkeys((result.unit for _, result in pairs), 0.0)  # seen to
+    looks = dict.fromkeys((result.unit for _, result in pairs), 0)
     quick = False
     while moving := [pair for pair in pairs if not pair[1].standing]:
         settling = False
@@ -101,16 +105,24 @@ def _verify(pairs: Pairs) -> None:
                 result.detail = str(error)
                 continue
             settling |= not status.moving
+            looks[result.unit] += 1
             _send([(drive, result)])
             last = before.get(result.unit)
             still = last is not None and abs(status.position - last) <= STILL_COUNTS
             result.standing = still and not status.moving
+            if status.moving or not (still or last is None):
+                moved_s[result.unit] = time.monotonic() - begun
             before[result.unit] = result.position = status.position
             if result.standing and result.acknowledged:
-                gone = time.monotonic() - begun
-                late = f"it moved on for {gone:.1f} s" * (gone > WENT_ON_S)
-                result.detail = "alarm" if status.fault else late
-        if time.monotonic() > end + VERIFY_S * settling:
+                gone_s = moved_s[result.unit]
+                went_on = f"it moved on for {gone_s:.1f} s" * (gone_s > WENT_ON_S)
+                result.detail = "alarm" if status.fault else went_on
+        slow = any(
+            0 < looks[result.unit] < ENOUGH or result.unit in drive.line.late
+            for drive, result in moving
+        )
+        times = MOST_TIMES if slow else 1 + settling
+        if time.monotonic() > begun + VERIFY_S * times:
             return
         time.sleep(POLL_S)
 

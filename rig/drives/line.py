@@ -96,6 +96,11 @@ class Line(abc.ABC):
         """Whether what a unit acknowledged last was perhaps not acknowledged."""
         return False
 
+    @property
+    def late(self) -> set[int]:
+        """Units whose replies came after their time."""
+        return set()
+
     def answers_for_every_unit(self) -> bool:
         """Whether a unit number that no device has is answered too."""
         return False

@@ -9,6 +9,7 @@ from test_rig_wire import behind_a_gateway, folder  # noqa: F401  # its locks
 from rig import stopping
 from rig.__main__ import main
 from rig.config import load_config
+from rig.core import stop as core_stop
 from rig.core.stop import stop_all
 from rig.drives.bus import Bus
 from rig.drives.modbus import ModbusDrive
@@ -92,3 +93,17 @@ def test_what_was_armed_from_its_folder_is_stopped_though_the_file_names_another
     said = capsys.readouterr().out
     assert ("NOT stopped, another device" in said) == elsewhere
     assert ("armed from this folder: stopping it as well" in said) != elsewhere
+
+
+def test_drives_behind_a_slow_gateway_are_seen_standing(monkeypatch):
+    """Three units at .2 s a reply had no time to be looked at twice."""
+    monkeypatch.setattr(core_stop, "VERIFY_S", 1.5)
+    with behind_a_gateway() as (sim, _, settings, config):
+        set_moving(sim, config)
+        for axis in config.axes:
+            slow = f"delayed_reply,seconds=0.2,axis={axis.name}"
+            sim.faults.add(parse_fault(slow))
+        with Bus(changed(settings, timeout_s=1.0)) as bus:
+            results = stop_all([ModbusDrive(bus, axis) for axis in config.axes])
+        assert all(unit.acknowledged and unit.standing for unit in results), results
+        assert not any(unit.detail for unit in results)  # not "it moved on for 3 s"

@@ -100,6 +100,9 @@ BUSES = [
     f"{BUS}{IMU}",
     f"{BUS}[imu] phone\n{IMU}",
     BUS + "port = 1\n",
+    BUS.replace("port =", "port = 70000\nport ="),
+    BUS.replace("port =", "port = x\nport ="),
+    BUS.replace(" = ", " "),
     BUS + 'host = ""\n',
     BUS.replace("0.1", "0.1:502"),
     BUS.replace("127", "tcp://127"),
@@ -140,6 +143,7 @@ def test_axes_of_one_list_are_read(old, new, read):
 UNITS = [
     "unit = 2,", "unit = 2;", "unit = 2 2", 'unit = "0x02"', "unit = [2]", "id = 2",
     "unit = 2\nunit = 0", 'unit = 2\nunit = "deg"', "unit := 2", "unit == 2",
+    "unit 2", "unit 2  # of three", "unit 2,",
     'unit = 2, reduction = 5', 'unit = 2\nmap = "leadshine_pr"\nmap = ""',
 ]  # fmt: skip
 
