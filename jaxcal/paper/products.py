@@ -24,7 +24,10 @@ _HEADS = 4
 _READ = 4  # squares that are read from every layer
 _DOUBLINGS = 2  # attention by the squared score to the power 2^2
 _SMALL = 1e-4  # added to squares of order one before their logarithm
+_APART = 1e6  # by which logits outside the whole choice are lower
 _SCALE = 12.0**0.5  # 1 / standard deviation of uniform commands in [0, 1]
+
+Memory = tuple[jax.Array, jax.Array | None]
 
 
 class ProductNetwork(Observing):
@@ -35,77 +38,113 @@ class ProductNetwork(Observing):
     """
 
     config: NetworkConfig
+    num_selected: int | None = None  # of mirror images; n + 1 where None
 
     @property
     def mask_is_chosen(self) -> bool:
         return True
 
+    def of_choices(self, num_selected: int) -> ProductNetwork:
+        return self.clone(num_selected=num_selected)
+
     def require_choices(self, num_inputs: int, num_selected: int) -> None:
-        if num_selected > num_inputs + 1:
+        if num_selected > num_inputs + 1 and not self.config.mirrored:
             raise ValueError(
-                f"kind observation reads at most {num_inputs} chosen postures: "
+                f"kind observation is trained to read {num_inputs} chosen postures: "
                 f"num_selected must be at most num_inputs + 1 = {num_inputs + 1}, got "
                 f"{num_selected}"
             )
 
-    def encode(self, features: jax.Array) -> jax.Array:
-        """(..., M, n + 1) centred and scaled commands, and 1."""
+    def encode(self, features: jax.Array) -> Memory:
+        """(..., M, n + 1) centred and scaled commands, and 1; ``mirrored``: with the
+        postures that it chooses of the set, (..., M) bool."""
         x = (features - 0.5) * _SCALE
-        return jnp.concatenate([x, jnp.ones_like(x[..., :1])], -1)
+        x = jnp.concatenate([x, jnp.ones_like(x[..., :1])], -1)
+        if not self.config.mirrored or self.is_initializing():
+            return x, None
+        return x, self._whole_choice(x, self.num_selected or x.shape[-1])
 
-    def decode(self, memory: jax.Array, decision: Decision) -> Scores:
-        """Scores of the next choice; ``mirrored``: from each of the 2^n mirror images
-        of the set, what most of them choose from the beginning has the largest logits.
-        Where none chose what is chosen already, the mean probability decides."""
-        x, available = memory, decision.available
-        value = jnp.zeros(available.shape[:-1])
-        if not self.config.mirrored:
-            return self._logits(x, available), value
-        p = x.shape[-1]
+    def decode(self, memory: Memory, decision: Decision) -> Scores:
+        """Scores of the next choice; ``mirrored``: those of the whole choice first,
+        unless others than these are chosen already."""
+        (x, whole), available = memory, decision.available
+        logits = self._logits(x, available, ~available[..., None, :])
+        if whole is not None:
+            fits = (available | whole).all(-1, keepdims=True)
+            logits = jnp.where(fits & whole & available, 0.0, -_APART) + logits
+        return logits, jnp.zeros(available.shape[:-1])
+
+    def _whole_choice(self, x: jax.Array, k: int) -> jax.Array:
+        """(..., M) bool, k postures of a set: in each of its 2^n mirror images k are
+        chosen, and each is twice taken back and chosen again, as the last; of what most
+        images chose, each is chosen again by the mean over all images."""
+        m, p = x.shape[-2:]
         signs = np.array([(*s, 1) for s in itertools.product((1, -1), repeat=p - 1)])
-        signs = signs.reshape(-1, *(1,) * (x.ndim - 1), p)
-        images = x[None] * signs.astype(x.dtype)
-        now = jnp.broadcast_to(available, (len(signs), *available.shape))
-        mean = nn.softmax(self._logits(images, now)).mean(0)
+        images = x[None] * signs.reshape(-1, *(1,) * (x.ndim - 1), p).astype(x.dtype)
         own, weights = self.clone(parent=None), self.variables
 
-        def choose(free: jax.Array, _: None) -> tuple[jax.Array, None]:
-            logits: Any = own.apply(weights, images, free, method="_logits")
-            return free & (jax.nn.one_hot(logits.argmax(-1), free.shape[-1]) == 0), None
+        def mask(chosen: jax.Array) -> jax.Array:
+            return jax.nn.one_hot(chosen, m, dtype=bool).any(-2)
 
-        free, _ = jax.lax.scan(choose, jnp.ones_like(now), length=p)
-        alike = (free[:, None] == free[None]).all(-1).sum(1)  # (2^n, ...) images
-        fits = (available[None] | ~free).all(-1)  # chose what is chosen already
-        votes = jnp.where(fits, (alike / len(signs)) ** 4, 0.0)[..., None] * ~free
-        logits = jnp.log(votes.sum(0) + 1e-6 * mean + 1e-30)
-        return mask_logits(logits, available), value
+        def logits(chosen: jax.Array) -> jax.Array:
+            size = chosen.shape[-1]
+            groups = [*itertools.combinations(range(size), min(size, p - 1))]
+            read = mask(chosen[..., np.array(groups, int)])
+            answer: Any = own.apply(
+                weights, images, ~mask(chosen), read, method="_logits"
+            )
+            return answer
+
+        def again(chosen: jax.Array, _: None) -> tuple[jax.Array, None]:
+            some = chosen[..., 1:]
+            return _with(some, logits(some)), None
+
+        def again_by_all(chosen: jax.Array, _: None) -> tuple[jax.Array, None]:
+            some = chosen[..., 1:]
+            mean = nn.log_softmax(logits(some)).mean(0, keepdims=True)
+            return _with(some, jnp.broadcast_to(mean, images.shape[:-1])), None
+
+        chosen = jnp.full((*images.shape[:-2], min(k, p)), -1)  # none, as its mask says
+        chosen = jax.lax.scan(again, chosen, length=chosen.shape[-1])[0]
+        while chosen.shape[-1] < k:
+            chosen = _with(chosen, logits(chosen))
+        chosen = jax.lax.scan(again, chosen, length=2 * k)[0]
+        sets = mask(chosen)
+        alike = (sets[:, None] == sets[None]).all(-1).sum(1)  # (2^n, ...) images
+        most = alike.argmax(0, keepdims=True)[..., None]
+        chosen = jnp.broadcast_to(jnp.take_along_axis(chosen, most, 0), chosen.shape)
+        return mask(jax.lax.scan(again_by_all, chosen, length=k)[0][0])
 
     @nn.compact
-    def _logits(self, x: jax.Array, available: jax.Array) -> jax.Array:
+    def _logits(self, x: jax.Array, free: jax.Array, groups: jax.Array) -> jax.Array:
+        """(..., M) scores of the ``free`` (..., M), given the chosen: at most n in each
+        of the ``groups`` (..., S, M) bool, of which squares are summed."""
         width, rounds, p = self.config.width, self.config.decoder_rounds, x.shape[-1]
-        free = available.astype(x.dtype)
-        number = free.sum(-1, keepdims=True)
-        step = jnp.minimum((~available).sum(-1), p - 1)
-        state, level = self._chosen(x, available, step)
+        step = jnp.minimum(groups.sum(-1), p - 1)
+        state, level = self._chosen(x, groups, step)
+        x, weight = x[..., None, :, :], free.astype(x.dtype)[..., None, :]
+        number = weight.sum(-1, keepdims=True)
         # The products are linear in x: taken of its axes, once for all candidates.
         first = _Product(4 * width, width, name="read_0")
         axes = jnp.broadcast_to(jnp.eye(p), (*state.shape[:-1], p, p))
         w, shown = x @ first(state[..., None, :], axes), []
         for i in range(rounds + 1):
-            square = ((w * w).mean(-1) * free).sum(-1, keepdims=True) / number + 1e-10
+            square = ((w * w).mean(-1) * weight).sum(-1, keepdims=True) / number + 1e-10
             w = w * jax.lax.rsqrt(square)[..., None]
             level = level + jnp.log(square)
             read = _dense(_READ, f"squares_{i}")(w)
             shown.append(jnp.log(_SMALL + read**2) + level[..., None])
             if i < rounds:
                 query = _dense(_HEADS * p, f"query_{i}")(w)
-                means, height = _attention(query, x, free)
+                means, height = _attention(query, x, weight)
                 shown.append(height + level[..., None])
                 w = _Product(4 * width, width, name=f"read_{i + 1}")(w, means)
-        logs = jnp.where(available[..., None], jnp.concatenate(shown, -1), -30.0)
+        logs = nn.logsumexp(jnp.concatenate(shown, -1), -3)
+        logs = jnp.where(free[..., None], logs, -30.0)
         below = jnp.maximum(logs - logs.max(-2, keepdims=True), -12.0)
-        now = jax.nn.one_hot(step, p)[..., None, :]
-        by_step = jnp.broadcast_to(now, (*x.shape[:-1], p))
+        now = jax.nn.one_hot(step[..., 0], p)[..., None, :]
+        x = x[..., 0, :, :]
+        by_step = jnp.broadcast_to(now, (*below.shape[:-1], p))
         hidden = jnp.concatenate([jnp.maximum(below, -6.0) / 2.0, x, by_step], -1)
         for i in range(2):
             hidden = nn.relu(nn.Dense(width, name=f"hidden_{i}")(hidden))
@@ -113,26 +152,30 @@ class ProductNetwork(Observing):
         size = below.shape[-1]
         even = nn.initializers.constant(0.2 / size)
         linear = now @ self.param("linear", even, (p, size))
-        logits = logits[..., 0] + (below * linear).sum(-1)
-        return mask_logits(logits, available)
+        return mask_logits(logits[..., 0] + (below * linear).sum(-1), free)
 
     def _chosen(
-        self, x: jax.Array, available: jax.Array, step: jax.Array
+        self, x: jax.Array, groups: jax.Array, step: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """(..., 64) the chosen postures as one vector, (..., 1) log of its square."""
+        """(..., S, 64) each group as one vector, (..., S, 1) log of its square."""
         read = _Product(4 * _STATE, _STATE, name="read_chosen")
         start = self.param("start", _normal(1.0), (_STATE,))
         state = jnp.broadcast_to(start, (*step.shape, _STATE))
-        level, left = jnp.zeros((*step.shape, 1)), ~available
+        level, left = jnp.zeros((*step.shape, 1)), groups
         for i in range(x.shape[-1] - 1):
             first = jax.nn.one_hot(jnp.argmax(left, -1), x.shape[-2])
             left &= first == 0.0
-            after = read(state, (first[..., None] * x).sum(-2))
+            after = read(state, first @ x)
             square = (after * after).mean(-1, keepdims=True) + 1e-8
             here = (i < step)[..., None]
             state = jnp.where(here, after * jax.lax.rsqrt(square), state)
             level = jnp.where(here, level + jnp.log(square), level)
         return state, level
+
+
+def _with(chosen: jax.Array, logits: jax.Array) -> jax.Array:
+    """The (..., c) chosen and the likeliest of (..., M)."""
+    return jnp.concatenate([chosen, logits.argmax(-1, keepdims=True)], -1)
 
 
 _normal = nn.initializers.normal

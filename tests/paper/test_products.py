@@ -82,27 +82,65 @@ def test_the_order_of_the_candidates_does_not_matter(params, chosen) -> None:
     )
 
 
-def test_the_shipped_agent_chooses_what_most_mirror_images_choose():
-    """Against the plain network on one image after the other, counted in numpy."""
+@pytest.mark.parametrize("k", [4, 6])
+def test_the_shipped_agent_takes_back_and_votes(k):
+    """Against loops over the plain network, one image and one posture at a time."""
     policy = checkpoint.load(SHIPPED)
     assert policy.network.config.mirrored
-    plain = build(PLAIN)
     rng = np.random.default_rng(3)
-    sets, everything = rng.random((6, 50, 3)), np.ones((6, 50), bool)
-    found = []
-    for signs in itertools.product((1.0, -1.0), repeat=3):
-        image = 0.5 + np.array(signs) * (sets - 0.5)
-        picks = scorer.choose(plain, policy.params, image, everything, k=4)
-        found.append(np.sort(picks, axis=1))
-    chosen = np.sort(
-        scorer.choose(policy.network, policy.params, sets, everything, k=4), axis=1
-    )
-    for row, own in enumerate(chosen):
-        count = collections.Counter(tuple(picks[row]) for picks in found)
-        assert count[tuple(own)] == max(count.values())
+    sets, everything = rng.random((3, 20, 3)), np.ones((3, 20), bool)
+    signs = np.array([*itertools.product((1.0, -1.0), repeat=3)])[:, None]
+
+    @jax.jit
+    def read(x, free, groups):
+        variables = {"params": policy.params}
+        return NETWORK.apply(variables, x, free, groups, method="_logits")
+
+    def logits(x, chosen):
+        groups = [*itertools.combinations(chosen, min(3, len(chosen)))]
+        masks = np.array([np.isin(np.arange(20), group) for group in groups])
+        return np.asarray(read(x, ~np.isin(np.arange(20), chosen), masks))
+
+    def whole_choice(commands):
+        images = 12.0**0.5 * signs * (commands - 0.5)
+        images = np.append(images, np.ones((8, 20, 1)), -1)
+        votes = collections.Counter()
+        order = {}
+        for x in images:
+            chosen = []
+            for _ in range(k):
+                chosen = [*chosen, logits(x, chosen).argmax()]
+            for _ in range(2 * k):
+                chosen = [*chosen[1:], logits(x, chosen[1:]).argmax()]
+            votes[frozenset(chosen)] += 1
+            order.setdefault(frozenset(chosen), chosen)
+        chosen = order[votes.most_common(1)[0][0]]
+        for _ in range(k):
+            some = chosen[1:]
+            mean = np.mean([jax.nn.log_softmax(logits(x, some)) for x in images], 0)
+            chosen = [*some, mean.argmax()]
+        return sorted(chosen)
+
+    def choose(sets):
+        network = policy.network
+        picks = scorer.choose(network, policy.params, sets, everything, k=k)
+        return np.sort(picks, axis=1).tolist()
+
+    own = choose(sets)
+    assert own == [whole_choice(commands) for commands in sets]
     mirror = sets * [1.0, -1.0, 1.0] + [0.0, 1.0, 0.0]
-    again = scorer.choose(policy.network, policy.params, mirror, everything, k=4)
-    np.testing.assert_array_equal(np.sort(again, axis=1), chosen)
+    assert choose(mirror) == own
+
+
+def test_a_state_that_is_not_its_own_is_continued(rng):
+    """Of two given postures at its worst places the others are its best answer."""
+    candidates = rng.random((50, 3))
+    order = np.argsort(np.abs(candidates - 0.5).max(axis=1))
+    options = {"checkpoint": SHIPPED, "required": order[:2]}
+    chosen = jaxcal.select(candidates, 4, "policy", **options)
+    assert set(order[:2]) <= {*chosen.indices.tolist()}
+    best = jaxcal.select(candidates, 4, "exact", required=order[:2])
+    assert chosen.log_det > best.log_det - 1.0
 
 
 def test_another_number_of_inputs_and_candidates_runs() -> None:

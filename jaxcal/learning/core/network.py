@@ -34,6 +34,10 @@ class Network(nn.Module):
         """Whether it takes a candidate that is not available for a chosen one."""
         return False
 
+    def of_choices(self, num_selected: int) -> Network:
+        """The network for K choices, where it asks for their number."""
+        return self
+
     def candidate_features(self, candidates: jax.Array, usable: jax.Array) -> Any:
         """Features of sets (..., M, n); (..., M) bool usable: available or chosen."""
         raise NotImplementedError(_OWN)  # abstract

@@ -98,7 +98,7 @@ def choose(
     given = np.zeros((len(free), 0)) if required is None else required
     seeds = range(len(free)) if seeds is None else seeds
     return decoders.choose(
-        NetworkScorer(network, params),
+        NetworkScorer(network.of_choices(k), params),
         rows,
         free,
         np.asarray(given, np.int64),
