@@ -3,6 +3,8 @@
 Loaded where an arm is asked for; nothing else of jaxcal loads it.
 """
 
+from typing import Any
+
 from jaxcal.arms.chain import SerialChain
 from jaxcal.arms.chains import Chains
 from jaxcal.arms.files.recordings import Servos
@@ -23,6 +25,7 @@ from jaxcal.arms.sensors import (
 )
 
 __all__ = [
+    "ArmCalibration",
     "Board",
     "Chains",
     "Distance",
@@ -40,3 +43,11 @@ __all__ = [
     "Tip",
     "Wrench",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name != "ArmCalibration":  # a model of an arm needs no calibration
+        raise AttributeError(f"module 'jaxcal.arms' has no attribute {name!r}")
+    from jaxcal.arms.written import ArmCalibration
+
+    return ArmCalibration

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,15 @@ from jaxcal.late import late
 from jaxcal.models.model import ErrorGroups, Fitting, as_parameters
 
 
-class ArmFitting(Fitting):
+class _Fitting(Fitting):
+    @property
+    def result_type(self) -> Any:
+        from jaxcal.arms.written import ArmCalibration
+
+        return ArmCalibration
+
+
+class ArmFitting(_Fitting):
     """What is asked of an arm with its sensor."""
 
     model: Arm
@@ -126,7 +135,7 @@ class ArmFitting(Fitting):
         return goal
 
 
-class ChainsFitting(Fitting):
+class ChainsFitting(_Fitting):
     """What is asked of several chains: of each, in its rows."""
 
     prepared = late("jaxcal.arms.plausible:prepared_chains", of="model")

@@ -18,7 +18,7 @@ from jaxcal.calibration.verdict import Verdict, verdict
 from jaxcal.checks import Mask, aligned, in_words
 from jaxcal.files import AnyPath
 from jaxcal.late import late
-from jaxcal.models.model import Model, of_arm
+from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 
 if TYPE_CHECKING:
@@ -41,13 +41,6 @@ class Calibration(Fit):
     plot = late("jaxcal.reports.shown:plot_calibration")
     _repr_html_ = late("jaxcal.reports.shown:as_html")
     verification = late("jaxcal.calibration.check:verification")
-    of = late("jaxcal.arms.written:of")
-    to_urdf = late("jaxcal.arms.written:to_urdf")
-    to_dh = late("jaxcal.arms.written:to_dh")
-    to_ur_kinematics = late("jaxcal.arms.written:to_ur_kinematics")
-    to_lerobot = late("jaxcal.arms.written:to_lerobot")
-    static_transform = late("jaxcal.arms.written:static_transform")
-    to_transform = late("jaxcal.arms.written:to_transform")
     to_dict = to_dict
     save = save
 
@@ -124,11 +117,6 @@ class Calibration(Fit):
 
         return mispairing(self)
 
-    @property
-    def arm(self) -> Any:
-        """The arm as calibrated, its parameters nominal, with Position()."""
-        return of_arm(self.whole, "calibrated")(self.estimate)
-
     def again(self, model: Any, prior: Prior | None, rows: Mask | None = None) -> Self:
         """The calibration by another model of the machine and a prior, None: as of
         ``identify``; of the same readings, or of some ``rows`` (N,) of them."""
@@ -163,4 +151,6 @@ class Calibration(Fit):
     @classmethod
     def from_dict(cls, content: Any, *, model: Model | None = None) -> Calibration:
         """The inverse of ``to_dict``; a ValueError names the key that is wrong."""
-        return cls(**file.fields(content, model))
+        fields = file.fields(content, model)
+        kind: Any = fields["model"].fitting.result_type or cls
+        return kind(**fields)

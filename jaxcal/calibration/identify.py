@@ -161,7 +161,8 @@ def identify(
         raise ValueError(f"{mispaired.reason}. Uncorrected: {error}") from None
     fields["provenance"] = provenance | fields["provenance"]
     fields |= {"input_names": inputs, "output_names": outputs}
-    calibration = Calibration(**fields, **units)
+    kind: Any = fields["model"].fitting.result_type or Calibration
+    calibration = kind(**fields, **units)
     if prior is None and plain_noise:
         calibration = model.fitting.improved(calibration)
     if sessions is not None:

@@ -116,8 +116,9 @@ class SavedFiles:
                 "above). --unproven writes it anyway"
             )
         lines = []
+        of_arm: Any = calibration
         if self.as_urdf:
-            tip = calibration.to_urdf(self.out, force=self.overwrite)
+            tip = of_arm.to_urdf(self.out, force=self.overwrite)
             lines = [f"saved {self.out}, tip link {tip}"]
         elif self.out:
             calibration.save(self.out)
@@ -129,7 +130,7 @@ class SavedFiles:
             for camera in range(count):
                 stem, ending = os.path.splitext(self.transform)
                 number = f"_{camera}" if count > 1 else ""
-                pose = calibration.to_transform(
+                pose = of_arm.to_transform(
                     f"{stem}{number}{ending}",
                     child=child.strip() + number * bool(child.strip()) or None,
                     parent=parent.strip() or None,
@@ -138,7 +139,7 @@ class SavedFiles:
                 )
                 lines.append(f"saved {stem}{number}{ending}: {pose}")
         if self.servos_out:
-            steps = calibration.to_lerobot(
+            steps = of_arm.to_lerobot(
                 self.servos_out, str(servos), force=self.overwrite
             )
             moved = ", ".join(f"{name} {step:+d}" for name, step in steps.items())

@@ -99,6 +99,7 @@ class Fitting:
     slips: Any = ()  # parameters that change when something slips
     misfit_std: Any = 0.0  # of a reading, what ``with_misfit`` leaves
     fits_misfit: Any = False  # ``with_misfit`` is fitted without a prior
+    result_type: Any = None  # the subclass of ``jaxcal.Calibration`` that it gives
 
     def __init__(self, model: Any) -> None:
         self.model = model

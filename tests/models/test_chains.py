@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.arms.files.urdf import joints_of
-from jaxcal.arms.written import of
+from jaxcal.arms.written import ArmCalibration
 from jaxcal.models import (
     Board,
     Chains,
@@ -273,7 +273,7 @@ def test_chains_that_share_no_joint_must_not_name_one_alike():
     with pytest.raises(ValueError, match="at least two arms"):
         Chains.of({"a": arm})
     with pytest.raises(ValueError, match="must be Chains, got SerialChain"):
-        of(SimpleNamespace(model=arm), "a")
+        ArmCalibration.of(SimpleNamespace(model=arm), "a")
 
 
 def test_a_file_keeps_which_sensor_is_one(robot):

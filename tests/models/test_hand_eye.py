@@ -141,6 +141,7 @@ def test_a_transform_needs_a_board_and_a_unit(tmp_path):
     found = jaxcal.identify(views, model=model)
     with pytest.raises(ValueError, match="measured_unit"):
         found.static_transform()
-    plain = jaxcal.identify(joints, joints[:, :2] + rng.normal(size=(20, 2)))
+    plain = SerialChain.from_dh(**SCARA)
+    places = plain.predict(joints) + rng.normal(scale=1e-3, size=(20, 3))
     with pytest.raises(ValueError, match="Board"):
-        plain.static_transform()
+        jaxcal.identify(joints, places, model=plain).static_transform()

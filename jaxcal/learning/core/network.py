@@ -55,11 +55,11 @@ class Network(nn.Module):
         share a program."""
         raise NotImplementedError(_OWN)  # abstract
 
-    def encode(self, features: Any) -> jax.Array:
-        """(..., M, width) memory of a set."""
+    def encode(self, features: Any) -> Any:
+        """(..., M, width) memory of a set, or a tree of arrays."""
         raise NotImplementedError(_OWN)  # abstract
 
-    def decode(self, memory: jax.Array, decision: Any) -> Scores:
+    def decode(self, memory: Any, decision: Any) -> Scores:
         """(..., M) logits, masked, and (...,) value."""
         raise NotImplementedError(_OWN)  # abstract
 
@@ -105,7 +105,7 @@ def encode(network: Network, params: Any, features: Any) -> Any:
     return network.apply({"params": params}, features, method="encode")
 
 
-def decode(network: Network, params: Any, memory: jax.Array, decision: Any) -> Any:
+def decode(network: Network, params: Any, memory: Any, decision: Any) -> Any:
     return network.apply({"params": params}, memory, decision, method="decode")
 
 
