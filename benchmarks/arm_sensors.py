@@ -41,6 +41,8 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from jaxcal.arms.written import for_file
+from jaxcal.calibration.fit import linearised
+from jaxcal.calibration.fit_model import fitted_again
 from jaxcal.models import (
     Board,
     Distance,
@@ -511,7 +513,7 @@ def files(draws: int) -> None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
                 written = for_file(found)[np.isin(found.names, plain.names)]
-                again = found.again(plain, plain.default_prior())
+                again = fitted_again(found, plain, plain.default_prior())
             low, high = np.clip(plain.limits, -180.0, 180.0).T
             anywhere = np.random.default_rng(0).uniform(low, high, (500, len(low)))
             arms = [found.arm, plain.calibrated(written), again.arm]
@@ -586,7 +588,7 @@ def _slipped(sensor: Sensor, seed: int) -> tuple[float, ...]:
     rest = offered[24:]
     few, many = (rest[found.verification(rest, count)] for count in (6, 24))
     holds = found.check(few, read(few, truth)).says == "holds"
-    slopes, covariance = found.linear(few)
+    slopes, covariance = linearised(found, few)
     rows = slopes.reshape(6 * q, -1)
     of_noise = np.diag(np.tile(np.asarray(found.noise_std) ** 2, 6))
     shares = []
@@ -765,7 +767,7 @@ def distances(_: int) -> None:
                 if other == trained:
                     continue
                 table = np.column_stack([joints, sockets])
-                slopes, covariance = found.linear(table)
+                slopes, covariance = linearised(found, table)
                 slopes[..., own] = 0.0  # those sockets are of the other place
                 which = [sockets == 0, sockets == 1]
                 points = [found.arm.predict(joints[at]).mean(axis=0) for at in which]

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.chain import turning
+from jaxcal.calibration.fit_model import fitted_again
 from jaxcal.calibration.verdict import left_out
 from jaxcal.checks import Array, numbers
 from jaxcal.models.model import ErrorGroups, Model
@@ -115,7 +116,7 @@ def improved(model: Chain, fit: Fit) -> Fit:
     before, trials = _held_out(fit), {}
     for words, other, prior in _alternatives(model):
         try:
-            trial = fit.again(other, prior)
+            trial = fitted_again(fit, other, prior)
             if trial.noise_std is not None:
                 trials[words] = trial, _held_out(trial)
         except ValueError:  # it does not converge

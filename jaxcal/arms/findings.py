@@ -10,6 +10,8 @@ import numpy as np
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.sensors import Socket, Wrench
 from jaxcal.arms.sensors.sensor import Readings
+from jaxcal.calibration.fit import outputs_at, stated_prior
+from jaxcal.calibration.fit_model import fitted_again
 from jaxcal.calibration.reasons import Reason, in_rows
 from jaxcal.calibration.verdict import outlying
 from jaxcal.checks import Array
@@ -289,7 +291,7 @@ def _freed(fit: Fit, part: Readings, row: int) -> tuple[float, float]:
     distances = sensor.distances
     rest = [one for one, kept in zip(distances, touched, strict=True) if kept]
     free = model.with_member(part.member, dataclasses.replace(sensor, distances=rest))
-    again = fit.again(free, fit.stated_prior)
+    again = fitted_again(fit, free, stated_prior(fit))
     _, _, distance, std = distances[row]
     if again.covariance is None:  # too few readings to tell the noise without it
         return distance, np.inf
@@ -427,7 +429,7 @@ def _swapped(fit: Fit, part: Readings, explains: bool) -> dict[int, int]:
         column = model.num_joints + model.sensor.inputs.index(sensor.inputs[0])
         stated = trial[..., column].copy()
         trial[..., column] = np.arange(sensor.num_places)[:, None]
-        off = np.abs(fit.outputs_at(trial) / noise).max(axis=-1)
+        off = np.abs(outputs_at(fit, trial) / noise).max(axis=-1)
         for other, row in np.argwhere((off < 4.0) & (stated != trial[..., column])):
             swaps[int(at[row])] = int(other)
     if isinstance(sensor, Socket) and not explains:

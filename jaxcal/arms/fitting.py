@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -17,9 +18,7 @@ from jaxcal.models.model import ErrorGroups, Fitting, as_parameters
 class _Fitting(Fitting):
     @property
     def result_type(self) -> Any:
-        from jaxcal.arms.written import ArmCalibration
-
-        return ArmCalibration
+        return importlib.import_module("jaxcal.arms.written").ArmCalibration
 
 
 class ArmFitting(_Fitting):

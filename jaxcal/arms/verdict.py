@@ -27,6 +27,7 @@ from jaxcal.arms.plausible import mistaken_columns
 from jaxcal.arms.sensors import Pose, Socket
 from jaxcal.arms.sensors.sensor import Readings, hats
 from jaxcal.calibration import verdict as models
+from jaxcal.calibration.fit import linearised, no_noise, session_std
 from jaxcal.calibration.reasons import Reason, computed, never_measured
 from jaxcal.calibration.verdict import left_out, wrong_noise
 from jaxcal.checks import Array, one_of
@@ -148,7 +149,7 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
         stds = np.broadcast_to(usual, (fit.num_outputs,))
         stds = stds if np.ptp(stds) else stds[:1]
         reason = Reason(
-            fit.no_noise("intervals and no verdict"),
+            no_noise(fit, "intervals and no verdict"),
             "measure more postures, or state noise_std, --noise (usual for this "
             f"sensor: {','.join(f'{std:.2g}' for std in stds)})",
         )
@@ -267,7 +268,7 @@ def _sessions(fit: Fit, first: HeldOut) -> str:
             "cannot show it (sessions=, --session)."
         )
     quantity = fit.model.quantities(fit.measured_unit)[0]
-    size = first.says(float(quantity.size(fit.session_std)))
+    size = first.says(float(quantity.size(session_std(fit))))
     return f"Sessions differ by {size} (1 sigma); predictions include this."
 
 
@@ -342,8 +343,8 @@ def _anywhere(fit: Fit, model: Chain, parts: list[Readings]) -> tuple[Readings, 
     low = np.where(turning, low, joints.min(axis=0))
     high = np.where(turning, high, joints.max(axis=0))
     drawn = np.random.default_rng(0).uniform(low, high, (_DRAWN, model.num_joints))
-    slopes, covariance = fit.linear(
-        np.hstack([drawn, np.repeat(columns, _DRAWN, axis=0)])
+    slopes, covariance = linearised(
+        fit, np.hstack([drawn, np.repeat(columns, _DRAWN, axis=0)])
     )
     slopes = slopes[:, :3] * part.scale[:3, None]
     slopes[..., part.own] = 0.0

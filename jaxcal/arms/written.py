@@ -19,6 +19,8 @@ from jaxcal.arms.files.write import fixed_joint, with_origins
 from jaxcal.arms.sensors import Board
 from jaxcal.arms.verdict import place_of
 from jaxcal.calibration import Calibration
+from jaxcal.calibration.fit import outputs_at
+from jaxcal.calibration.fit_model import fitted_again
 from jaxcal.checks import Array, one_of
 from jaxcal.files import AnyPath, write_over
 from jaxcal.models.uncertainty import Prior
@@ -40,9 +42,9 @@ def for_file(fit: ArmCalibration) -> Array:
     errors = ""
     if held.all():
         change = "it was fitted without harmonics"
-        again = fit.again(plain, plain.default_prior())
+        again = fitted_again(fit, plain, plain.default_prior())
         parameters = again.parameters
-        off: Array = again.outputs_at(fit.commands) - fit.outputs_at(fit.commands)
+        off: Array = outputs_at(again, fit.commands) - outputs_at(fit, fit.commands)
         if again.noise_std is not None and fit.noise_std is not None:
             verdicts: tuple[Any, Any] = again.verdict, fit.verdict
             errors = (
@@ -127,7 +129,7 @@ def static_transform(
     owns = [model.names[model.own(i)] for i in range(len(sensors))]
     fitted = {*tool, *(name for own in owns for name in own)}
     held = tuple(name for name in model.names if name not in fitted)
-    again = fit.again(model, Prior(model.default_prior().std, fixed=held))
+    again = fitted_again(fit, model, Prior(model.default_prior().std, fixed=held))
     theta, source = again.parameters, model.source
     if sensor.moves == "camera":
         names = tool
@@ -280,7 +282,7 @@ class ArmCalibration(Calibration):
         prior = plain.default_prior()
         held = tuple(name for name in plain.names if name not in fitted)
         fixed = tuple(dict.fromkeys((*prior.fixed, *held)))
-        again = self.again(plain, dataclasses.replace(prior, fixed=fixed))
+        again = fitted_again(self, plain, dataclasses.replace(prior, fixed=fixed))
         steps: dict[str, int] = plain.write_servos(
             path, again.parameters, servos, names or {}, force=force
         )

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import os
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxcal.calibration import file
 from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
-from jaxcal.calibration.fit_model import fit_model
 from jaxcal.calibration.inverse import command_for
 from jaxcal.calibration.verdict import Verdict, verdict
-from jaxcal.checks import Mask, aligned, in_words
+from jaxcal.checks import aligned, in_words
 from jaxcal.files import AnyPath
 from jaxcal.late import late
 from jaxcal.models.model import Model
-from jaxcal.models.uncertainty import Noise, Prior
 
 if TYPE_CHECKING:
     from jaxcal.calibration.pairing import Mispairing
@@ -116,25 +113,6 @@ class Calibration(Fit):
         from jaxcal.calibration.pairing import mispairing
 
         return mispairing(self)
-
-    def again(self, model: Any, prior: Prior | None, rows: Mask | None = None) -> Self:
-        """The calibration by another model of the machine and a prior, None: as of
-        ``identify``; of the same readings, or of some ``rows`` (N,) of them."""
-        used = self.loss_weights > 0.0
-        fields = fit_model(
-            self.commands,
-            self.measured,
-            (used if rows is None else used & rows).astype(np.float64),
-            model=model,
-            prior=prior,
-            noise=Noise(std=self.noise_std if self.noise_known else None),
-            loss=self.loss,
-            common_noise=None,
-        )
-        ours = ("prior", "noise_levels")
-        origin = {k: v for k, v in self.provenance.items() if k not in ours}
-        fields["provenance"] = origin | fields["provenance"]
-        return dataclasses.replace(self, **fields)
 
     # -- from a file -------------------------------------------------------------------
 

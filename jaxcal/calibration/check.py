@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.fit import Fit, columns_of, linearised, noise_of, outputs_at
 from jaxcal.calibration.pairing import of_new_readings
 from jaxcal.checks import Array, Indices, Mask, array_of, by_unit, whole_number
 from jaxcal.files import AnyPath
@@ -305,8 +305,8 @@ def _deviations(
     calibration: Fit, commands: Array, measured: Array, placed_anew: bool
 ) -> _Deviations:
     """The deviations of measurements, of which ``check`` has the arguments."""
-    noise = calibration.require_noise("check")
-    predicted = calibration.outputs_at(commands)
+    noise = noise_of(calibration, "check")
+    predicted = outputs_at(calibration, commands)
     off = calibration.model.fitting.wrapped(measured - predicted, commands)
     _require_unit(calibration, predicted + off, predicted, noise)
     slopes = np.asarray(calibration.model.jacobian(commands, calibration.parameters))
@@ -347,7 +347,7 @@ def _checked(
     """Commands (N, n) and readings (N, m)."""
     postures = _postures(calibration, "commands", commands)
     shape, rule = (len(postures), calibration.num_outputs), ": as many rows as commands"
-    given = calibration.by_name("measured", measured, quiet=measured is commands)
+    given = columns_of(calibration, "measured", measured, quiet=measured is commands)
     return postures, array_of("measured", given, *shape, rule=rule)
 
 
@@ -357,7 +357,7 @@ def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, 
     from scipy.linalg import lapack
 
     variances = np.tile(noise**2, len(commands))
-    slopes, parameters = calibration.linear(commands)
+    slopes, parameters = linearised(calibration, commands)
     slopes = slopes.reshape(len(variances), -1)
     try:
         factor = np.linalg.cholesky(np.diag(variances) + slopes @ parameters @ slopes.T)
@@ -368,7 +368,7 @@ def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, 
         ) from None
     root = np.asarray(lapack.dtrtri(factor, lower=1)[0])  # rest of factor: zeros
     # Misfit that is allowed for may not be there, and hides a drift all the same.
-    slopes, parameters = calibration.linear(commands, misfit=False)
+    slopes, parameters = linearised(calibration, commands, misfit=False)
     by = root @ slopes.reshape(len(variances), -1)
     least = (root**2 @ variances).sum() + ((by @ parameters) * by).sum()
     return root, float(least) / len(root)
@@ -400,7 +400,7 @@ def _size(values: Array, axis: int | None = None) -> Any:
 
 def _postures(calibration: Fit, name: str, given: ArrayLike) -> Array:
     """(N, n) commands that the calibration's machine can take."""
-    given = calibration.by_name(name, given)
+    given = columns_of(calibration, name, given)
     rows = array_of(name, given, "N", calibration.num_inputs)
     if not len(rows):
         raise ValueError(f"{name} must hold at least one row, got none")
@@ -444,7 +444,7 @@ def _changes(calibration: Fit, tolerances: Mapping[str, float]) -> Array:
 
 def _levels(calibration: Fit) -> NDArray[np.intp]:
     """(m,) from 0: outputs of the same number share an estimate of their noise."""
-    noise, dof = calibration.require_noise("check"), calibration.noise_dof
+    noise, dof = noise_of(calibration, "check"), calibration.noise_dof
     if not dof or dof >= (1.0 - 1e-9) * calibration.dof:  # given, or one estimate
         return np.zeros(len(noise), dtype=np.intp)
     return np.unique(noise, return_inverse=True)[1]
@@ -469,9 +469,9 @@ def verification(
     points = _postures(calibration, "candidates", candidates)
     if not 1 <= whole_number("k", k, 1) <= len(points):
         raise ValueError(f"k must be in [1, {len(points)}], got {k}")
-    noise = calibration.require_noise("verification")
+    noise = noise_of(calibration, "verification")
     slopes = np.asarray(calibration.model.jacobian(points, calibration.parameters))
-    prediction_slopes, covariance = calibration.linear(points)
+    prediction_slopes, covariance = linearised(calibration, points)
     turned = np.matrix_transpose(prediction_slopes)
     spread = prediction_slopes @ covariance @ turned + np.diag(noise**2)
     white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes

@@ -100,31 +100,13 @@ class Fit:
         return self.model.names
 
     @property
-    def stated_prior(self) -> Prior | None:
-        """The prior that ``identify`` was given, unless sized; None: the model's."""
-        if self.provenance.get("prior") != "stated":
-            return None
-        p, names = len(self.names), np.array(self.names)
-        with np.errstate(divide="ignore"):
-            std = self.prior_precision[:p] ** -0.5
-        held = names[self.free[:p] == 0.0].tolist()
-        return Prior(std, mean=self.prior_mean[:p], fixed=held)
-
-    @property
     def covariance(self) -> Array | None:
         """(p, p) of ``parameters``, directions that nothing determines held fixed; None
         where the noise is unknown."""
         if self.joint_covariance is None:
             return None
-        p, turn = len(self.names), self.to_parameters
+        p, turn = len(self.names), to_parameters(self)
         return turn @ self.joint_covariance[:p, :p] @ turn.T
-
-    @property
-    def to_parameters(self) -> Array:
-        """(p, p) from the coordinates of ``joint_covariance`` to ``parameters``."""
-        if self.centre is None:
-            return np.eye(len(self.names))
-        return np.asarray(self.model.centred(-self.centre))
 
     @property
     def standard_errors(self) -> Array | None:
@@ -133,7 +115,7 @@ class Fit:
         if covariance is None:
             return None
         joint = np.asarray(self.joint_covariance)[: len(covariance), : len(covariance)]
-        variance = above_rounding(np.diag(covariance), self.to_parameters, joint)
+        variance = above_rounding(np.diag(covariance), to_parameters(self), joint)
         return np.where(self.undetermined, np.inf, np.sqrt(variance))
 
     @property
@@ -171,8 +153,8 @@ class Fit:
     def confidence_intervals(self, confidence: float = 0.95) -> Array:
         """(p, 2) lower and upper end for each parameter, one at a time, by Student's t
         where the noise was estimated. A ValueError where it is unknown."""
-        self.require_noise("confidence intervals")
-        half = self.quantile(confidence) * np.asarray(self.standard_errors)
+        noise_of(self, "confidence intervals")
+        half = quantile(self, confidence) * np.asarray(self.standard_errors)
         return np.stack([self.parameters - half, self.parameters + half], axis=-1)
 
     def predict_interval(
@@ -185,7 +167,7 @@ class Fit:
         """Lower and upper end, (..., m) each; arguments as for ``predict_std``."""
         centre = self.predict(commands)
         std = self.predict_std(commands, new_measurement=new_measurement)
-        half = self.quantile(confidence) * std
+        half = quantile(self, confidence) * std
         return centre - half, centre + half
 
     # -- the fit -----------------------------------------------------------------------
@@ -220,19 +202,11 @@ class Fit:
 
     def predict(self, commands: ArrayLike) -> Array:
         """Outputs (..., m) at commands (..., n); a warning tells of far ones."""
-        points = self.points("commands", commands, self.num_inputs)
+        points = as_points(self, "commands", commands, self.num_inputs)
         rows = points.reshape(-1, self.num_inputs)
         sides = [(self.input_names, rows, self._range)]
         say_far("command", slice(None), sides)
-        return self.outputs_at(points)
-
-    def outputs_at(self, commands: ArrayLike) -> Array:
-        """``predict`` without a warning."""
-        points = self.points("commands", commands, self.num_inputs)
-        outputs = predict(
-            self.whole, points.reshape(-1, self.num_inputs), self.estimate
-        )
-        return outputs.reshape(*points.shape[:-1], self.num_outputs)
+        return outputs_at(self, points)
 
     @functools.cached_property
     def _range(self) -> Array:
@@ -248,53 +222,13 @@ class Fit:
 
         ``new_measurement`` adds the noise of one more measurement of weight 1.
         """
-        points = self.points("commands", commands, self.num_inputs)
-        noise = self.require_noise("prediction uncertainty")
+        points = as_points(self, "commands", commands, self.num_inputs)
+        noise = noise_of(self, "prediction uncertainty")
         rows = points.reshape(-1, self.num_inputs)
-        variance = self.variance(rows, noise**2 if new_measurement else 0.0 * noise)
+        variance = variance_of(self, rows, noise**2 if new_measurement else 0.0 * noise)
         return np.sqrt(variance).reshape(*points.shape[:-1], self.num_outputs)
 
-    def variance(self, rows: Array, of_readings: Array) -> Array:
-        """(N, m) of ``predict`` at ``rows`` (N, n) and of readings (m,) there."""
-        slopes, covariance = self.linear(rows)
-        variance = above_rounding(
-            ((slopes @ covariance) * slopes).sum(axis=-1), slopes, covariance
-        )
-        more = self.model.fitting.unexplained(self, rows) ** 2
-        variance = variance + np.maximum(more, of_readings) + self.session_std**2
-        if self.unidentified is not None:
-            variance = np.where(depends(slopes, self.unseen), np.inf, variance)
-        return variance
-
-    @property
-    def session_std(self) -> Array:
-        """(m,) standard deviation between sessions; 0 where one alone was stated."""
-        of_sessions = self.provenance.get("sessions", {"std": [0.0]})
-        return np.broadcast_to(np.array(of_sessions["std"]), (self.num_outputs,))
-
     # -- inside ------------------------------------------------------------------------
-
-    def linear(self, rows: Array, *, misfit: bool = True) -> tuple[Array, Array]:
-        """(N, m, P) derivatives of predictions at ``rows`` (N, n), and the covariance
-        (P, P) of all parameters; without ``misfit`` of the model's alone, as if there
-        were no harmonics but those that were fitted."""
-        if self.centre is not None:
-            rows = rows - self.centre
-        joint, p = np.asarray(self.joint_covariance), len(self.names)
-        if misfit or self.estimate[p:].any():
-            return derivative(self.whole, rows, self.estimate), joint
-        by = joint[:p, p:]
-        within = joint[:p, :p] - by * self.prior_precision[p:] @ by.T
-        return derivative(self.model, rows, self.parameters), within
-
-    @property
-    def unseen(self) -> Array:
-        """(z, P) directions that nothing determines, as ``linear`` has the slopes."""
-        null = self.unidentified
-        null = np.zeros((0, len(self.estimate))) if null is None else null
-        if self.centre is None:
-            return null
-        return null @ np.asarray(self.model.centred(self.centre)).T
 
     @functools.cached_property
     def whole(self) -> Model:
@@ -309,53 +243,123 @@ class Fit:
             return np.zeros(len(self.parameters), dtype=np.bool_)
         return np.asarray(self.unidentified[:, : len(self.parameters)].any(axis=0))
 
-    def points(self, name: str, values: ArrayLike, width: int) -> Array:
-        """(..., width) commands, or outputs; of a data frame by name."""
-        points = numbers(name, self.by_name(name, values))
-        if points.ndim < 1 or points.shape[-1] != width:
-            raise ValueError(
-                f"{name} must have shape (..., {width}), got {points.shape}"
-            )
-        return points
-
-    def by_name(self, name: str, values: ArrayLike, *, quiet: bool = False) -> Any:
-        """The calibration's columns of a data frame, in its order; else as given. What
-        it has beside them is said, unless ``quiet``."""
-        inputs, outputs = self.input_names, self.output_names
-        if name in ("desired", "measured", "readings"):
-            beside = None if quiet else inputs
-            return of_frame(name, values, outputs, MEASURED, beside=beside)
-        levels = getattr(self.model, "levels", ())
-        return of_frame(name, values, inputs, COMMANDS, None, levels, outputs)
-
-    def require_noise(self, what: str) -> Array:
-        if self.noise_std is None:
-            raise ValueError(self.no_noise(what))
-        return self.noise_std
-
-    def quantile(self, confidence: float) -> float:
-        """Half-width of an interval in standard errors."""
-        if not 0.0 < array_of("confidence", confidence) < 1.0:
-            raise ValueError(f"confidence must be in (0, 1), got {confidence}")
-        from scipy import special  # loads in half the time of scipy.stats
-
-        upper = 0.5 + 0.5 * confidence
-        if self.noise_known:
-            return float(special.ndtri(upper))
-        return float(special.stdtrit(self.noise_dof, upper))
-
-    def no_noise(self, what: str) -> str:
-        left = f"only {self.dof:.2g}" if self.dof >= 0.5 else "no"
-        return (
-            f"no {what}, because the noise is unknown: {self.num_measurements} "
-            f"measurements leave {left} residual degree of freedom for "
-            f"{int(self.free.sum())} free parameters. Measure more, or give noise_std"
-        )
-
     def _affine(self, name: str) -> tuple[Array, Array]:
         if self.affine is None:
             raise AttributeError(f"{name}: only an affine model y = A u + b has this")
         return self.affine
+
+
+def stated_prior(fit: Fit) -> Prior | None:
+    """The prior that ``identify`` was given, unless sized; None: the model's."""
+    if fit.provenance.get("prior") != "stated":
+        return None
+    p, names = len(fit.names), np.array(fit.names)
+    with np.errstate(divide="ignore"):
+        std = fit.prior_precision[:p] ** -0.5
+    held = names[fit.free[:p] == 0.0].tolist()
+    return Prior(std, mean=fit.prior_mean[:p], fixed=held)
+
+
+def to_parameters(fit: Fit) -> Array:
+    """(p, p) from the coordinates of ``joint_covariance`` to ``parameters``."""
+    if fit.centre is None:
+        return np.eye(len(fit.names))
+    return np.asarray(fit.model.centred(-fit.centre))
+
+
+def outputs_at(fit: Fit, commands: ArrayLike) -> Array:
+    """``predict`` without a warning."""
+    points = as_points(fit, "commands", commands, fit.num_inputs)
+    outputs = predict(fit.whole, points.reshape(-1, fit.num_inputs), fit.estimate)
+    return outputs.reshape(*points.shape[:-1], fit.num_outputs)
+
+
+def variance_of(fit: Fit, rows: Array, of_readings: Array) -> Array:
+    """(N, m) of ``predict`` at ``rows`` (N, n) and of readings (m,) there."""
+    slopes, covariance = linearised(fit, rows)
+    variance = above_rounding(
+        ((slopes @ covariance) * slopes).sum(axis=-1), slopes, covariance
+    )
+    more = fit.model.fitting.unexplained(fit, rows) ** 2
+    variance = variance + np.maximum(more, of_readings) + session_std(fit) ** 2
+    if fit.unidentified is not None:
+        variance = np.where(depends(slopes, unseen_directions(fit)), np.inf, variance)
+    return variance
+
+
+def session_std(fit: Fit) -> Array:
+    """(m,) standard deviation between sessions; 0 where one alone was stated."""
+    of_sessions = fit.provenance.get("sessions", {"std": [0.0]})
+    return np.broadcast_to(np.array(of_sessions["std"]), (fit.num_outputs,))
+
+
+def linearised(fit: Fit, rows: Array, *, misfit: bool = True) -> tuple[Array, Array]:
+    """(N, m, P) derivatives of predictions at ``rows`` (N, n), and the covariance
+    (P, P) of all parameters; without ``misfit`` of the model's alone, as if there
+    were no harmonics but those that were fitted."""
+    if fit.centre is not None:
+        rows = rows - fit.centre
+    joint, p = np.asarray(fit.joint_covariance), len(fit.names)
+    if misfit or fit.estimate[p:].any():
+        return derivative(fit.whole, rows, fit.estimate), joint
+    by = joint[:p, p:]
+    within = joint[:p, :p] - by * fit.prior_precision[p:] @ by.T
+    return derivative(fit.model, rows, fit.parameters), within
+
+
+def unseen_directions(fit: Fit) -> Array:
+    """(z, P) directions that nothing determines, as ``linearised`` has the slopes."""
+    null = fit.unidentified
+    null = np.zeros((0, len(fit.estimate))) if null is None else null
+    if fit.centre is None:
+        return null
+    return null @ np.asarray(fit.model.centred(fit.centre)).T
+
+
+def as_points(fit: Fit, name: str, values: ArrayLike, width: int) -> Array:
+    """(..., width) commands, or outputs; of a data frame by name."""
+    points = numbers(name, columns_of(fit, name, values))
+    if points.ndim < 1 or points.shape[-1] != width:
+        raise ValueError(f"{name} must have shape (..., {width}), got {points.shape}")
+    return points
+
+
+def columns_of(fit: Fit, name: str, values: ArrayLike, *, quiet: bool = False) -> Any:
+    """The calibration's columns of a data frame, in its order; else as given. What
+    it has beside them is said, unless ``quiet``."""
+    inputs, outputs = fit.input_names, fit.output_names
+    if name in ("desired", "measured", "readings"):
+        beside = None if quiet else inputs
+        return of_frame(name, values, outputs, MEASURED, beside=beside)
+    levels = getattr(fit.model, "levels", ())
+    return of_frame(name, values, inputs, COMMANDS, None, levels, outputs)
+
+
+def noise_of(fit: Fit, what: str) -> Array:
+    if fit.noise_std is None:
+        raise ValueError(no_noise(fit, what))
+    return fit.noise_std
+
+
+def quantile(fit: Fit, confidence: float) -> float:
+    """Half-width of an interval in standard errors."""
+    if not 0.0 < array_of("confidence", confidence) < 1.0:
+        raise ValueError(f"confidence must be in (0, 1), got {confidence}")
+    from scipy import special  # loads in half the time of scipy.stats
+
+    upper = 0.5 + 0.5 * confidence
+    if fit.noise_known:
+        return float(special.ndtri(upper))
+    return float(special.stdtrit(fit.noise_dof, upper))
+
+
+def no_noise(fit: Fit, what: str) -> str:
+    left = f"only {fit.dof:.2g}" if fit.dof >= 0.5 else "no"
+    return (
+        f"no {what}, because the noise is unknown: {fit.num_measurements} "
+        f"measurements leave {left} residual degree of freedom for "
+        f"{int(fit.free.sum())} free parameters. Measure more, or give noise_std"
+    )
 
 
 def above_rounding(variance: Array, rows: Array, covariance: Array) -> Array:

@@ -404,3 +404,25 @@ def _require_readings(solution: FitSolution, used: int, undetermined: int) -> No
         f"them stay unknown{f' ({words})' if words else ''}. Measure more, or give a "
         "prior or fixed parameters"
     )
+
+
+def fitted_again(
+    fit: Any, model: Any, prior: Prior | None, rows: Mask | None = None
+) -> Any:
+    """A calibration by another model of the machine and a prior, None: as of
+    ``identify``; of the same readings, or of some ``rows`` (N,) of them."""
+    used = fit.loss_weights > 0.0
+    fields = fit_model(
+        fit.commands,
+        fit.measured,
+        (used if rows is None else used & rows).astype(np.float64),
+        model=model,
+        prior=prior,
+        noise=Noise(std=fit.noise_std if fit.noise_known else None),
+        loss=fit.loss,
+        common_noise=None,
+    )
+    ours = ("prior", "noise_levels")
+    origin = {k: v for k, v in fit.provenance.items() if k not in ours}
+    fields["provenance"] = origin | fields["provenance"]
+    return dataclasses.replace(fit, **fields)

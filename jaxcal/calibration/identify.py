@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.calibration.calibration import Calibration
-from jaxcal.calibration.fit_model import fit_model, require_fitting
+from jaxcal.calibration.fit import outputs_at, stated_prior
+from jaxcal.calibration.fit_model import fit_model, fitted_again, require_fitting
 from jaxcal.calibration.pairing import of_unfitted
 from jaxcal.calibration.verdict import CalibrationWarning
 from jaxcal.checks import (
@@ -296,14 +297,14 @@ def _with_sessions(fit: Calibration, labels: ArrayLike) -> Calibration:
     square, expected = [], []
     for label in range(len(names)):
         try:
-            trial = fit.again(fit.model, fit.stated_prior, which != label)
+            trial = fitted_again(fit, fit.model, stated_prior(fit), which != label)
         except ValueError:
             continue
         rows = (which == label) & (fit.loss_weights > 0.0)
         if trial.noise_std is not None and rows.any():
             commands = fit.commands[rows]
             off = fit.model.fitting.wrapped(
-                fit.measured[rows] - trial.outputs_at(commands), commands
+                fit.measured[rows] - outputs_at(trial, commands), commands
             )
             square.append(off**2)
             expected.append(trial.predict_std(commands, new_measurement=True) ** 2)

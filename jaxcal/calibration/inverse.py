@@ -7,7 +7,13 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.calibration.fit import Fit, say_far
+from jaxcal.calibration.fit import (
+    Fit,
+    as_points,
+    linearised,
+    say_far,
+    unseen_directions,
+)
 from jaxcal.checks import Array, Mask, array_of, in_words
 from jaxcal.information.singular import (
     depends,
@@ -58,7 +64,7 @@ def command_for(
             determines; m exceeds n.
     """
     n, m = fit.num_inputs, fit.num_outputs
-    points = fit.points("desired", desired, m)
+    points = as_points(fit, "desired", desired, m)
     if not points.size:
         return np.zeros((*points.shape[:-1], n))
     if m > n:
@@ -68,7 +74,7 @@ def command_for(
     bounds = limits_of(limits, fit.input_names)
     begin = None
     if start is not None:
-        first = fit.points("start", start, n)
+        first = as_points(fit, "start", start, n)
         begin = np.broadcast_to(first, (*points.shape[:-1], n)).reshape(-1, n)
     search = _Search(fit, points.reshape(-1, m), begin)
     if search.affine:
@@ -199,8 +205,8 @@ class Responses:
         fit = self.fit
         if fit.unidentified is None:
             return
-        slopes = fit.linear(commands)[0]
-        for i, j in np.argwhere(depends(slopes, fit.unseen))[:1]:
+        slopes = linearised(fit, commands)[0]
+        for i, j in np.argwhere(depends(slopes, unseen_directions(fit)))[:1]:
             used = fit.commands[fit.loss_weights > 0.0]
             where = fit.estimate, fit.prior_precision, fit.free > 0.0
             words = [

@@ -13,7 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.calibration.fit import FAR, Fit
+from jaxcal.calibration.fit import (
+    FAR,
+    Fit,
+    as_points,
+    columns_of,
+    linearised,
+    noise_of,
+    quantile,
+    variance_of,
+)
 from jaxcal.calibration.inverse import Responses, command_for, limits_of
 from jaxcal.checks import Array, aligned, numbers, whole_number
 
@@ -83,16 +92,16 @@ def inverse(
         ValueError: the noise is unknown; inputs and outputs differ in number; a reading
             agrees with no command.
     """
-    noise = fit.require_noise("uncertainty of a command")
+    noise = noise_of(fit, "uncertainty of a command")
     n, m = fit.num_inputs, fit.num_outputs
     if n != m:
         raise ValueError(f"inverse needs as many inputs as outputs, got {n} and {m}")
     variance = noise**2 / whole_number("repeats", repeats, 1)
-    factor = fit.quantile(confidence)
-    given: Any = numbers("readings", fit.by_name("readings", readings))
+    factor = quantile(fit, confidence)
+    given: Any = numbers("readings", columns_of(fit, "readings", readings))
     if m == 1 and (not given.ndim or given.shape[-1] != 1):
         given = given[..., None]
-    points = fit.points("readings", given, m)
+    points = as_points(fit, "readings", given, m)
     flat, shape = points.reshape(-1, m), points.shape[:-1]
     bounds = limits_of(limits, fit.input_names)
     solved: list[tuple[float, Array, str]] = []
@@ -135,12 +144,12 @@ def _first_order(fit: Fit, commands: Array, of_readings: Array) -> Array:
     """(P, n) standard uncertainties of commands."""
     turn = by_readings(fit, commands)
     if fit.num_inputs == 1:
-        return np.abs(turn[..., 0]) * np.sqrt(fit.variance(commands, of_readings))
+        return np.abs(turn[..., 0]) * np.sqrt(variance_of(fit, commands, of_readings))
     Responses(fit).require_determined(commands)
-    slopes, covariance = fit.linear(commands)
+    slopes, covariance = linearised(fit, commands)
     together = slopes @ covariance @ np.matrix_transpose(slopes)
     # What is not of the parameters is independent from output to output.
-    single = fit.variance(commands, of_readings)
+    single = variance_of(fit, commands, of_readings)
     of_parameters = np.diagonal(together, axis1=1, axis2=2)
     beside = np.maximum(single - of_parameters, 0.0)
     together = together + beside[..., None] * np.eye(fit.num_outputs)
@@ -171,7 +180,7 @@ class _Curve:
         """(R,) outputs, and how far readings may be from them; NaN where none is."""
         rows = commands[:, None]
         outputs = self.responses.outputs(rows)[:, 0]
-        variance = self.fit.variance(rows, self.of_readings)[:, 0]
+        variance = variance_of(self.fit, rows, self.of_readings)[:, 0]
         return outputs, self.factor * np.sqrt(variance)
 
     def solve(self, reading: float) -> tuple[float, Array, str]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.calibration.fit import linearised, no_noise, noise_of
 from jaxcal.calibration.reasons import (
     Reason,
     computed,
@@ -83,8 +84,8 @@ class CalibrationWarning(UserWarning):
 
 def left_out(fit: Fit) -> Array:
     """(N, m) residual of each measurement from the fit without it, to first order."""
-    noise = fit.require_noise("held-out errors")
-    slopes, covariance = fit.linear(fit.commands, misfit=False)
+    noise = noise_of(fit, "held-out errors")
+    slopes, covariance = linearised(fit, fit.commands, misfit=False)
     spread = slopes @ covariance @ np.matrix_transpose(slopes)
     root = np.diag(1.0 / np.where(noise > 0.0, noise, 1.0))
     share = np.minimum(fit.loss_weights, 1.0)[:, None, None]
@@ -101,7 +102,7 @@ def _no_noise(fit: Fit) -> Reason | None:
     if fit.noise_std is not None:
         return None
     return Reason(
-        fit.no_noise("intervals"), "measure more rows, or state noise_std, --noise"
+        no_noise(fit, "intervals"), "measure more rows, or state noise_std, --noise"
     )
 
 
@@ -226,7 +227,7 @@ def _on_its_way(fit: Fit) -> Reason | None:
     white = fit.residuals / fit.noise_std
     if not _in_noise(fit, white):
         return None
-    slopes, covariance = fit.linear(fit.commands, misfit=False)
+    slopes, covariance = linearised(fit, fit.commands, misfit=False)
     rows = slopes / fit.noise_std[:, None]
     pull = np.einsum("nqp,nq->p", rows, fit.loss_weights[:, None] * white)
     pull += fit.prior_precision * (fit.prior_mean - fit.estimate)
@@ -312,7 +313,7 @@ def bends(fit: Fit) -> Reason | None:
     terms = np.hstack([unit, unit[:, i] * unit[:, j]])
     root = np.outer(fit.loss_weights[sample] ** 0.5, 1.0 / noise).ravel()
     white = root * fit.residuals[sample].ravel()
-    slopes = fit.linear(commands, misfit=False)[0].reshape(len(white), -1)
+    slopes = linearised(fit, commands, misfit=False)[0].reshape(len(white), -1)
     both = np.hstack([slopes, np.kron(terms, np.eye(m))])
 
     def unexplained(columns: Array) -> tuple[float, int]:

@@ -16,7 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.fit import (
+    Fit,
+    as_points,
+    linearised,
+    noise_of,
+    outputs_at,
+    quantile,
+    to_parameters,
+    unseen_directions,
+)
 from jaxcal.calibration.of_readings import by_readings, inverse
 from jaxcal.checks import Array, aligned, one_or_each
 from jaxcal.information.singular import depends
@@ -178,8 +187,8 @@ def budget(
     Raises:
         ValueError: the noise is unknown, or an argument is wrong, by name.
     """
-    calibration.require_noise("uncertainty budget")
-    calibration.quantile(confidence)  # must be in (0, 1)
+    noise_of(calibration, "uncertainty budget")
+    quantile(calibration, confidence)  # must be in (0, 1)
     if wrong := [one for one in sources if not isinstance(one, Source)]:
         raise ValueError(
             f"sources must hold jaxcal.calibration.Source, got {wrong[0]!r}"
@@ -192,7 +201,7 @@ def budget(
         raise ValueError("budget takes commands or readings, not both")
     slopes, parts = results.slopes, _parts(calibration, results.slopes)
     if results.turn is not None:
-        noise = calibration.require_noise("budget") ** 2 / repeats
+        noise = noise_of(calibration, "budget") ** 2 / repeats
         parts[_READING] = results.turn**2 @ noise, calibration.noise_dof or np.inf
     gain = _gain(calibration, slopes.shape[-1]) if sources else None
     for source in sources:
@@ -228,15 +237,15 @@ def _results(calibration: Fit, commands: ArrayLike | None) -> _Results:
     if commands is None:
         p = len(calibration.names)
         slopes = np.eye(p, len(np.asarray(calibration.joint_covariance)))
-        slopes[:, :p] = calibration.to_parameters
+        slopes[:, :p] = to_parameters(calibration)
         return _Results(calibration.names, calibration.parameters, "", slopes)
-    points = calibration.points("commands", commands, calibration.num_inputs)
+    points = as_points(calibration, "commands", commands, calibration.num_inputs)
     points = points.reshape(-1, calibration.num_inputs)
-    slopes = calibration.linear(points)[0]
+    slopes = linearised(calibration, points)[0]
     outputs = calibration.output_names
     return _Results(
         tuple(f"{output} at row {i}" for i in range(len(points)) for output in outputs),
-        calibration.outputs_at(points).ravel(),
+        outputs_at(calibration, points).ravel(),
         calibration.measured_unit,
         slopes.reshape(-1, slopes.shape[-1]),
     )
@@ -248,7 +257,7 @@ def _of_readings(calibration: Fit, readings: ArrayLike, repeats: int) -> _Result
     n, m = calibration.num_inputs, calibration.num_outputs
     commands, names = answer.commands.reshape(-1, n), calibration.input_names
     turn = by_readings(calibration, commands)
-    slopes = -turn @ calibration.linear(commands)[0]
+    slopes = -turn @ linearised(calibration, commands)[0]
     return _Results(
         tuple(f"{name} of reading {i}" for i in range(len(commands)) for name in names),
         commands.ravel(),
@@ -273,7 +282,7 @@ def _parts(calibration: Fit, slopes: Array) -> dict[str, tuple[Array, float]]:
     before, misfit = share * before, share * misfit
     noise = np.maximum(total - before - misfit, 0.0)
     if calibration.unidentified is not None:
-        undetermined = depends(slopes, calibration.unseen[:, :width])
+        undetermined = depends(slopes, unseen_directions(calibration)[:, :width])
         noise = np.where(undetermined, np.inf, noise)
     parts = {"noise": (noise, calibration.noise_dof or np.inf)}
     if before.any():
@@ -288,8 +297,8 @@ def _gain(calibration: Fit, width: int) -> Array:
     estimated = calibration.estimated_commands
     at = calibration.commands if estimated is None else estimated
     free = calibration.free[:width] > 0.0
-    slopes = calibration.linear(at)[0][..., :width] * free
-    variance = np.maximum(calibration.require_noise("budget") ** 2, 1e-300)
+    slopes = linearised(calibration, at)[0][..., :width] * free
+    variance = np.maximum(noise_of(calibration, "budget") ** 2, 1e-300)
     root = np.sqrt(calibration.loss_weights[:, None] / variance)
     rows = (slopes * root[..., None]).reshape(-1, width)
     prior_root = np.sqrt(calibration.prior_precision[:width] * free)

@@ -19,7 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.calibration.check import Check
-from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.fit import (
+    Fit,
+    as_points,
+    linearised,
+    no_noise,
+    noise_of,
+    outputs_at,
+)
 from jaxcal.calibration.verdict import left_out
 from jaxcal.checks import Array
 from jaxcal.extras import needs
@@ -157,7 +164,7 @@ def _of_predictions(calibration: Fit, sources: Sequence[Source]) -> Budget:
     commands = calibration.commands
     spread = commands.std(axis=0)
     off = (commands - commands.mean(axis=0)) / np.where(spread > 0.0, spread, 1.0)
-    std = calibration.predict_std(commands) / calibration.require_noise("budget")
+    std = calibration.predict_std(commands) / noise_of(calibration, "budget")
     rows = [int((off**2).sum(axis=1).argmin()), int((std**2).sum(axis=1).argmax())]
     names = [
         f"{output} at {row}" for row in rows for output in calibration.output_names
@@ -263,7 +270,7 @@ def _parameter_section(calibration: Fit, budgets: Sequence[Budget]) -> pages.Sec
         cells = zip(calibration.names, calibration.parameters, strict=True)
         blocks = [
             pages.Table(("", "value"), [[name, f"{x:.6g}"] for name, x in cells]),
-            pages.Text(calibration.no_noise("intervals"), "warning"),
+            pages.Text(no_noise(calibration, "intervals"), "warning"),
         ]
     return pages.Section("Parameters", blocks, "parameters")
 
@@ -286,10 +293,10 @@ def _text(value: Any) -> str:
 def _new_section(
     calibration: Fit, commands: ArrayLike, measured: ArrayLike
 ) -> pages.Section:
-    commands = calibration.points("commands", commands, calibration.num_inputs)
-    off = calibration.points("measured", measured, calibration.num_outputs)
+    commands = as_points(calibration, "commands", commands, calibration.num_inputs)
+    off = as_points(calibration, "measured", measured, calibration.num_outputs)
     off = calibration.model.fitting.wrapped(
-        off - calibration.outputs_at(commands), commands
+        off - outputs_at(calibration, commands), commands
     )
     std = calibration.predict_std(commands, new_measurement=True)
     kinds = ("off", "off in standard deviations")
@@ -393,8 +400,8 @@ def _scatter(
 
 def leverage(calibration: Fit) -> Array:
     """(N, m) in [0, 1], how far each reading determines its own prediction."""
-    noise = calibration.require_noise("leverage")
-    slopes, covariance = calibration.linear(calibration.commands, misfit=False)
+    noise = noise_of(calibration, "leverage")
+    slopes, covariance = linearised(calibration, calibration.commands, misfit=False)
     spread = ((slopes @ covariance) * slopes).sum(axis=-1)
     return np.asarray(spread / np.where(noise > 0.0, noise, np.inf) ** 2)
 

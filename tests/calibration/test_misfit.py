@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal.calibration.fit import linearised
 from jaxcal.models import Pose, SerialChain, Socket
 
 from ..models.arms import CONTACTS, contacts_of_a_panda, ur5
@@ -198,7 +199,7 @@ def test_contacts_of_eccentric_gears_err_elsewhere_as_predicted():
             told.append((size, found.estimate[-28:].any()))
             off = found.arm.predict(wide[:, :7])
             off -= bent.calibrated(truth).predict(wide[:, :7])
-            slopes, covariance = found.linear(wide)
+            slopes, covariance = linearised(found, wide)
             moves = slopes - slopes.mean(axis=0)  # a place is known by its middle
             variance = np.einsum("nqi,ij,nqj->nq", moves, covariance, moves)
             inside = np.abs(off - off.mean(axis=0)) < 1.96 * np.sqrt(variance)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxcal.calibration.fit import noise_of, outputs_at, stated_prior
 from jaxcal.calibration.pairing.fit import (
     BEFORE,
     FOREIGN,
@@ -118,7 +119,7 @@ def mispairing(fit: Fit) -> Mispairing | None:
 
 def _taken_up(fit: Fit) -> Mispairing | None:
     """A unit, a sign or a place that a nonlinear fit took up in its parameters."""
-    if fit.stated_prior is not None and not fit.prior_precision.any():
+    if stated_prior(fit) is not None and not fit.prior_precision.any():
         return None  # its mean is where a search starts, no machine
     from jaxcal.calibration.pairing.rearranged import by_nominal
 
@@ -155,7 +156,7 @@ def of_new_readings(fit: Fit, commands: Array, measured: Array) -> Mispairing | 
     table = _table(fit.whole, commands, measured, here, held=True)
     if table is None:
         return None
-    noise = np.asarray(fit.require_noise("check"))
+    noise = np.asarray(noise_of(fit, "check"))
     table = dataclasses.replace(
         table, scale=noise, width=table.width * table.scale / noise
     )
@@ -184,8 +185,8 @@ def _rows_off(table: Table) -> Mispairing | None:
 
 def of_fit(fit: Fit) -> Table | None:
     """The table of a fit, linearised there."""
-    prior = fit.stated_prior or fit.model.default_prior()
-    measured = fit.residuals + fit.outputs_at(fit.commands)
+    prior = stated_prior(fit) or fit.model.default_prior()
+    measured = fit.residuals + outputs_at(fit, fit.commands)
     counted = fit.loss_weights > 0.0
     table = _table(fit.model, fit.commands, measured, prior, counted)
     return table and dataclasses.replace(table, theta=np.asarray(fit.parameters))
@@ -329,7 +330,7 @@ def _plainly_right(fit: Fit) -> bool:
     off, used = fit.residuals, fit.loss_weights > 0.0
     if not used.all():
         return False
-    said = fit.outputs_at(fit.commands)
+    said = outputs_at(fit, fit.commands)
     rms = np.sqrt((off**2).mean(axis=0))
     apart = np.sort(np.abs(said[1:] - said[:-1]), axis=0)[len(off) // 2 - 1]
     if (rms <= _EXACT * apart).all():

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxcal.calibration.fit import linearised
 from jaxcal.calibration.pairing.fit import as_it_is, benign_fits, fitted, predicted
 from jaxcal.calibration.pairing.judge import LEAST, RATIO, Mispairing, better, of_fit
 from jaxcal.calibration.reasons import Reason, in_rows
@@ -98,7 +99,7 @@ def _uneven(fit: Fit) -> bool:
         return False
     # Few rows of very many hide in no noise.
     sample = slice(None, None, max(len(fit.commands) // _SAMPLE, 1))
-    slopes = fit.linear(fit.commands[sample], misfit=False)[0] / noise[:, None]
+    slopes = linearised(fit, fit.commands[sample], misfit=False)[0] / noise[:, None]
     shape = fit.residuals[sample].shape
     first = off = (fit.residuals[sample] / noise).ravel()
     flat = slopes.reshape(len(first), -1)
