@@ -120,6 +120,10 @@ class Chains(Model):
                 path, base=base, tip=tip, sensor=sensor, locked=locked
             )
             arms[tip] = arm._limited({n: ends[n] for n in arm.joint_names if n in ends})
+        for name in ends:
+            one_of(
+                "limits", name, [n for arm in arms.values() for n in arm.joint_names]
+            )
         model = cls.of(arms)
         chains = []
         for arm, shared in zip(model.chains, model._shared, strict=True):

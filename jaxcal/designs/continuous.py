@@ -158,9 +158,12 @@ def refine(
     if isinstance(selection, Selection):
         rows = selection.indices
         criterion = _same_criterion(selection) if criterion is None else criterion
-    rows = array_of("selection", rows, "k").astype(np.int64)
+    rows = array_of("selection", rows, "k")
+    require_none(rows % 1.0 != 0.0, rows, "selection must hold whole numbers")
     outside = (rows < 0) | (rows >= len(candidates))
     require_none(outside, rows, f"selection must lie in [0, {len(candidates)})")
+    rows = rows.astype(np.int64)
+    require_none(~available[rows], rows, "selection must hold available candidates")
     begun = candidates[rows]
     limits = _range(candidates[available], allowed) if limits is None else limits
     box, n = box_of(limits, allowed, offer.columns), candidates.shape[1]

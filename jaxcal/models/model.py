@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import os
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
@@ -174,6 +175,17 @@ class Fitting:
         return None
 
 
+def _warn_of_hooks(kind: type) -> None:
+    """Say what a class defines that is asked of ``model.fitting``, and not of it."""
+    for name, value in vars(kind).items():
+        if name in vars(Fitting) and callable(value) and name[0] != "_":
+            warnings.warn(
+                f"{kind.__name__}.{name} is not used: define it in a class derived "
+                "from jaxcal.models.model.Fitting, which the property fitting returns",
+                stacklevel=3,
+            )
+
+
 class Model(abc.ABC):
     """n commands, p parameters, q outputs; everything is float64 in the caller's units.
 
@@ -198,6 +210,10 @@ class Model(abc.ABC):
     linear: ClassVar[Any] = False  # ``f(u; theta) = J(u) theta``, J exact
     multiplicity: ClassVar[Any] = 0  # m where all outputs share one regressor
     periods: ClassVar[Any] = None  # (q,) of readings that wrap, as 360; inf: does not
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        _warn_of_hooks(cls)
 
     # -- f and its derivatives ---------------------------------------------------------
 
@@ -343,6 +359,7 @@ class _Adapter(Model):
 
     def __init__(self, own: Any) -> None:
         self._own = own
+        _warn_of_hooks(type(own))
 
     def __getattribute__(self, name: str) -> Any:
         if not name.startswith("_"):

@@ -749,6 +749,15 @@ def test_a_model_of_ones_own_answers_for_itself(monkeypatch):
     assert not hasattr(calibration, "to_urdf")  # as only of an arm
 
 
+def test_a_hook_that_nobody_asks_is_named():
+    text = "Turning.wrapped is not used: define it in a class derived from .*Fitting"
+    with pytest.warns(UserWarning, match=text):
+
+        class Turning(Line):
+            def wrapped(self, off, commands):
+                return off
+
+
 def test_what_a_copy_of_a_model_is_asked_is_of_the_copy():
     model = Polynomial(1, 1)
     assert model.fitting.wrapped(np.array([[350.0]]), np.zeros((1, 1))) == 350.0

@@ -102,6 +102,12 @@ def robot(tmp_path):
     return tracked(urdf(tmp_path / "robot.urdf"))
 
 
+def test_a_limit_of_a_joint_that_no_chain_has_is_refused(tmp_path):
+    path, sensors = urdf(tmp_path / "robot.urdf"), dict.fromkeys(HANDS, Position())
+    with pytest.raises(ValueError, match=r"limits must be one of .*, got 'wirst'"):
+        Chains.from_urdf(path, sensors, limits={"wirst": (-1.0, 1.0)})
+
+
 def postures(model, count, seed):
     """Commands of both chains, half of the rows each."""
     rng = np.random.default_rng(seed)

@@ -249,6 +249,12 @@ def test_bad_input_is_named():
         design.refine([0, 1, 2], [[0.0, 0.1]])
     with pytest.raises(ValueError, match="allowed must be a function of one command"):
         design.refine([0, 1, 2], allowed=3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"whole numbers, got 1\.5"):
+        design.refine([0, 1.5, 2])
+    some = np.random.default_rng(0).random((9, 2))
+    masked = jaxcal.Design(some, Affine(2, 1), available=np.arange(9) > 0)
+    with pytest.raises(ValueError, match="available candidates, got 0"):
+        masked.refine([0, 1, 2])
     with pytest.raises(ValueError, match="selection must be within the limits"):
         design.refine([0, 1, 2], [[0.0, 0.1]] * 2)
     with pytest.raises(ValueError, match=r"selection must lie in \[0, 9\), got 9"):
