@@ -2,13 +2,14 @@
 
 A run folder is large and not in version control. What a report needs of it is small and
 goes to a folder of its own: ``metrics.csv`` (the trainer's columns, at most
-``MAX_ROWS`` rows), ``last_rewards.npy`` (rewards of the last 1,000 episodes) and
+``MAX_ROWS`` rows), ``last_rewards.npy`` (rewards of the last 1,000 episodes),
 ``summary.json`` (preset, configuration, versions, episodes, wall time, and how good the
-policy is).
+policy is) and ``policy.npz`` (the weights; of over ``HALVED`` in half precision).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import pathlib
 import shutil
@@ -21,17 +22,20 @@ from numpy.typing import NDArray
 
 from jaxcal.arguments import Parser, exit_code, values_of
 from jaxcal.files import require_writable_folder, write_text
+from jaxcal.learning.runtime import weights
 from jaxcal.tables import csv_text
 
 Array = NDArray[np.float64]
 
 MAX_ROWS = 1_000
+HALVED = 1_000_000  # weights
 _LAST_OF_BLOCK = ("update", "episodes", "seconds", "learning_rate")
 _IF_MEASURED = ("ratio_to_exact", "hit_rate")
 
 _DESCRIPTION = """\
 Keep what the reproduction report draws of training runs, finished or still going:
-metrics.csv, last_rewards.npy and summary.json, in a folder under --out for each.
+metrics.csv, last_rewards.npy, summary.json and the weights, in a folder under --out
+for each.
 
   python train.py --seed 3 --episodes 200000 --no-close-up \\
       --out runs/compact_seeds/seed_3
@@ -48,10 +52,17 @@ def collect(run: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
         ValueError: a file of the run cannot be understood.
     """
     from jaxcal.evaluation.figures import read_metrics
+    from jaxcal.learning.training import checkpoint
 
     metrics = read_metrics(run / "metrics.csv")
-    summary = _summary(run)
+    policy = checkpoint.load(run)
+    summary = _summary(run, policy)
     out.mkdir(parents=True, exist_ok=True)
+    held = policy.weights
+    if summary["parameters"] > HALVED:
+        half = {name: array.astype(np.float16) for name, array in held.arrays.items()}
+        held = dataclasses.replace(held, arrays=half)
+    weights.write(out / "policy.npz", held)
     rewards = run / "last_rewards.npy"
     if rewards.is_file():
         shutil.copyfile(rewards, out / "last_rewards.npy")
@@ -89,15 +100,11 @@ def thinned(metrics: dict[str, Array], max_rows: int = MAX_ROWS) -> dict[str, Ar
     }
 
 
-def _summary(run: pathlib.Path) -> dict[str, Any]:
+def _summary(run: pathlib.Path, policy: Any) -> dict[str, Any]:
     """What the run was and how good its policy is, measured on dataset2."""
-    import jax
-
     from jaxcal.evaluation.methods import evaluate
-    from jaxcal.learning.training import checkpoint
     from jaxcal.paper.datasets import make_dataset
 
-    policy = checkpoint.load(run)
     data = make_dataset("dataset2")
     measured = evaluate(data, 4, ("policy",), (str(run),), random_draws=1)
     row = measured.summary(measured.results[0])
@@ -105,7 +112,7 @@ def _summary(run: pathlib.Path) -> dict[str, Any]:
     return {
         **{name: policy.meta[name] for name in ("preset", "seed", "versions")},
         "configuration": {name: policy.meta[name] for name in ("ppo", "network")},
-        "parameters": sum(leaf.size for leaf in jax.tree.leaves(policy.params)),
+        "parameters": sum(a.size for a in policy.weights.arrays.values()),
         "episodes": progress["episodes"],
         "planned_episodes": policy.meta["ppo"]["num_episodes"],
         "seconds": float(progress["seconds"]),

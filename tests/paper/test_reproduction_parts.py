@@ -229,10 +229,10 @@ def test_seeds_have_students_intervals(tmp_path: pathlib.Path) -> None:
 
 
 def test_the_paper_run_says_how_far_it_went(tmp_path: pathlib.Path) -> None:
-    _keep(tmp_path / "done" / "paper", 0, -0.1)
+    _keep(tmp_path / "done" / "paper_seeds" / "seed_0", 0, -0.1)
     found = _shown(tmp_path / "done")["figure_2_paper"]
     assert found.verdict == "agrees" and "200,000 of 200,000" in found.ours
-    _keep(tmp_path / "part" / "paper", 0, -0.1, finished=False)
+    _keep(tmp_path / "part" / "paper_seeds" / "seed_0", 0, -0.1, finished=False)
     found = _shown(tmp_path / "part")["figure_2_paper"]
     assert found.verdict == "not comparable" and "not finished" in found.ours
 
@@ -252,7 +252,7 @@ def test_a_run_converges_within_the_paper_s_episodes_or_not(
     tmp_path: pathlib.Path, run: dict[str, float], verdict: str
 ) -> None:
     values = {"level": -0.1} | run
-    for place in ("paper", "compact_seeds/seed_0", "compact_seeds/seed_1"):
+    for place in ("paper_seeds/seed_0", "compact_seeds/seed_0", "compact_seeds/seed_1"):
         _keep(tmp_path / place, int(place[-1] == "1"), **values)
     found = _shown(tmp_path)
     assert [found[key].verdict for key in ("figure_2", "figure_2_paper")] == [
@@ -265,7 +265,8 @@ def test_a_run_converges_within_the_paper_s_episodes_or_not(
 
 
 def test_a_torn_summary_is_named(tmp_path: pathlib.Path) -> None:
-    _keep(tmp_path / "paper", 0, -0.1)
-    (tmp_path / "paper" / "summary.json").write_text('{"seed": 0')
+    run = tmp_path / "paper_seeds" / "seed_0"
+    _keep(run, 0, -0.1)
+    (run / "summary.json").write_text('{"seed": 0')
     with pytest.raises(ValueError, match=r"summary\.json is not the summary"):
         _shown(tmp_path)

@@ -8,9 +8,11 @@ import pathlib
 import numpy as np
 import pytest
 
+from benchmarks.paper import training_runs
 from benchmarks.paper.training_runs import main, thinned
 from jaxcal.commands.train import main as train
 from jaxcal.evaluation.figures import read_metrics
+from jaxcal.learning.training import checkpoint
 
 
 def test_thinning_keeps_moments_and_last_values(rng: np.random.Generator) -> None:
@@ -47,7 +49,9 @@ def test_a_folder_that_is_no_run_is_named(
 
 @pytest.mark.slow
 def test_a_run_of_train_is_kept(
-    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: pathlib.Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     run, kept = tmp_path / "seed_3", tmp_path / "kept" / "seed_3"
     given = ["--seed", "3", "--episodes", "4096", "--out", str(run)]
@@ -62,3 +66,15 @@ def test_a_run_of_train_is_kept(
     metrics, whole = (read_metrics(f / "metrics.csv") for f in (kept, run))
     np.testing.assert_allclose(metrics["reward_mean"], whole["reward_mean"], rtol=1e-5)
     assert np.load(kept / "last_rewards.npy").shape == (1000,)
+    own = checkpoint.load(run).weights.arrays
+    again = checkpoint.load(kept / "policy.npz").weights.arrays
+    assert own.keys() == again.keys()
+    assert all(np.array_equal(own[name], again[name]) for name in own)
+    monkeypatch.setattr(training_runs, "HALVED", 1)
+    assert main([str(run), "--out", str(tmp_path / "halved")]) == 0
+    halved = tmp_path / "halved" / "seed_3" / "policy.npz"
+    assert halved.stat().st_size < 0.6 * (kept / "policy.npz").stat().st_size
+    half = checkpoint.load(halved).weights.arrays
+    assert {array.dtype for array in half.values()} == {np.dtype(np.float32)}
+    for name in own:
+        np.testing.assert_allclose(half[name], own[name], rtol=1e-3, atol=1e-4)

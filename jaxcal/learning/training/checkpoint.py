@@ -235,10 +235,11 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
     seeds = meta.get("num_seeds", 1)
     if path.is_file():
         arrays = weights.read(path).arrays
-        params = jax.tree.map(jax.numpy.asarray, unflatten_dict(arrays, sep="."))
         wanted = flatten_dict(like, sep=".")
         if jax.tree.map(np.shape, arrays) != jax.tree.map(lambda x: x.shape, wanted):
             raise CheckpointError(f"checkpoint {path} cannot be {what}")
+        typed = {n: jax.numpy.asarray(a, wanted[n].dtype) for n, a in arrays.items()}
+        params = unflatten_dict(typed, sep=".")
     elif seeds == 1:
         params = _read(path / "policy", like, what)
     else:
