@@ -127,6 +127,23 @@ def test_the_row_is_named_wherever_it_is():
     assert sum(named) >= 19
 
 
+def test_sessions_of_another_gain_are_told_of_one_reading():
+    """At a residual of five times the noise; as n + 1 parameters 8 of 20 were."""
+    named = []
+    for seed in range(20):
+        rng = np.random.default_rng([3, 1, seed])
+        slopes, bias = rng.normal(size=3), rng.normal()
+        u, row = rng.uniform(-1.0, 1.0, (20, 3)), rng.integers(6, 15)
+        gains = np.where(np.arange(20) < row, 1.0, 1.0 + 0.3 * rng.choice([-1, 1]))
+        y = (u @ slopes * gains + bias)[:, None]
+        regressors = np.hstack([u, np.ones((20, 1))])
+        square = np.linalg.lstsq(regressors, y, rcond=None)[1]
+        y += np.sqrt(square / 16.0 / 24.0) * rng.normal(size=y.shape)
+        found = _verdict(u, y).mispairing
+        named.append(found is not None and "two sessions" in found.reason)
+    assert sum(named) >= 17
+
+
 def _right_tables():
     rng = np.random.default_rng(5)
     for seed in range(12):

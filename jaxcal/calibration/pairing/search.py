@@ -251,6 +251,11 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     kinds = [("offset", ones, _LEAST)]
     if table.shared:
         kinds.append(("parameters", slopes[:, 0], slopes.shape[-1] + 2))
+        if right.shape[-1] == 1:  # another gain of the one reading
+            theta = np.linalg.lstsq(slopes[:, 0], right[:, 0], rcond=None)[0]
+            said = slopes[:, 0] @ theta
+            for gain in (said, said - said.mean(), np.hstack([ones, said])):
+                kinds.append(("parameters", gain, gain.shape[-1] + 2))
     elif table.model.linear and not table.free.any():  # calibrated before
         moved = np.hstack([ones, table.commands - table.commands.mean(axis=0)])
         kinds.append(("parameters", moved, moved.shape[-1] + 2))
