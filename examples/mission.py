@@ -13,6 +13,7 @@ compares this file with jaxcal's functions number for number.
 from __future__ import annotations
 
 import itertools
+import select
 import socket
 import subprocess
 import sys
@@ -231,17 +232,17 @@ def move(bus: ModbusTcpClient, degrees: np.ndarray) -> None:
             time.sleep(0.02)  # bit 2 of the status: it moves
 
 
-def attitude(phone: Any, seconds: float = 0.3) -> np.ndarray:
+def attitude(phone: socket.socket, count: int = 30) -> np.ndarray:
     """(3, 3) mean rotation that the phone reports from now on."""
-    until, total = time.monotonic() + 0.1, np.zeros((3, 3))
-    while time.monotonic() < until + seconds:
-        line = phone.readline()
-        if time.monotonic() < until:  # what was sent before
-            continue
-        azimuth, pitch, roll = np.radians([float(x) for x in line.split(",")[1:4]])
+    while select.select([phone], [], [], 0)[0] and phone.recv(1 << 16):
+        pass  # what was sent before
+    lines, total = phone.makefile(), np.zeros((3, 3))
+    lines.readline()  # perhaps the rest of one
+    for _ in range(count):
+        angles = [float(x) for x in lines.readline().split(",")[1:4]]
+        azimuth, pitch, roll = np.radians(angles)
         total += turn(2, -azimuth) @ turn(1, -roll) @ turn(0, -pitch)
-    left, _, right = np.linalg.svd(total)
-    return left @ right
+    return np.linalg.svd(total)[0] @ np.linalg.svd(total)[2]
 
 
 def turn(axis: int, angle: float) -> np.ndarray:
@@ -271,7 +272,7 @@ def measure(commands: np.ndarray) -> np.ndarray:
             port = int(device.stdout.readline().split()[1].rpartition(":")[2])
             where = device.stdout.readline().strip().rpartition(":")[2]
             with socket.create_server(("127.0.0.1", int(where))) as server:
-                phone = server.accept()[0].makefile()
+                phone = server.accept()[0]
                 with ModbusTcpClient("127.0.0.1", port=port) as bus:
                     zero = attitude(phone)  # it stands upright in its jig
                     y = []
@@ -287,8 +288,7 @@ def measure(commands: np.ndarray) -> np.ndarray:
 
 def main() -> None:
     policy, params = train(jax.random.key(0))
-    rng = np.random.default_rng(0)
-    sets = rng.random((20, M, N))
+    sets = np.random.default_rng(0).random((20, M, N))
     shares = [share_of_optimum(poses, choose(policy, params, poses)) for poses in sets]
     print(f"20 unseen sets: {np.mean(shares):.3f} of the best det S in the mean")
     commands = LIMIT * (2.0 * sets[0][choose(policy, params, sets[0])] - 1.0)
