@@ -61,6 +61,7 @@ def trend_lines(runs: list[Record]) -> tuple[list[str], bool]:
         if "prediction" in run:
             _, worst = held_out(run)
             error = f"{worst:.4f} {run.get('unit', 'deg')} (limit {run['limit']:g})"
+        if moved or "prediction" in run:
             reasons = [f"{run['name']}: {x}" for x in recalibrate(run, run["limit"])]
         when = f"{datetime.datetime.fromtimestamp(run['time']):%Y-%m-%d %H:%M}"
         rows.append([when, run["name"], run["mode"], error, moved])

@@ -536,6 +536,12 @@ def test_trend_tells_what_moved_and_separates_devices(run, capsys):
     shutil.rmtree(other)
     shutil.rmtree(unreal)
     assert main(["trend", str(run.parent)]) == 0
+    for name in ("prediction", "after"):  # nothing was held out
+        summary.pop(name, None)
+    summary["mispairing"] = "the readings from row 2 on are one row late"
+    (later / "summary.json").write_text(json.dumps(summary))
+    assert main(["trend", str(run.parent)]) == 1
+    assert "RECALIBRATE: later: the readings from row 2" in capsys.readouterr().out
     assert main(["trend", str(unfinished)]) == 2
     assert main(["trend", str(run.parent / "none")]) == 2
 
