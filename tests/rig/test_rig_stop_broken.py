@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import pathlib
 import random
 import shutil
 import signal
@@ -384,6 +385,20 @@ def test_it_loads_its_own_drives_and_nothing_heavy(rig, folder):
     loaded, _, others = done.stderr.partition("LOADED")[2].partition("|")
     assert set(loaded.split()) <= MAY, set(loaded.split()) - MAY
     assert not others.split()
+
+
+@pytest.mark.parametrize("init", ["def (", "import no_such_module", "1 / 0", None])
+def test_a_jaxcal_that_cannot_be_imported_does_not_keep_it(init, rig, tmp_path):
+    root, installed = pathlib.Path(stop_config.__file__).parents[1], tmp_path / "site"
+    (installed / "jaxcal").mkdir(parents=True)
+    (installed / "rig").symlink_to(root / "rig")
+    if init is not None:
+        (installed / "jaxcal" / "__init__.py").write_text(init)
+    shutil.copy(root / "jaxcal" / "jsonlines.py", installed / "jaxcal")
+    program = [sys.executable, "-m", "rig", "stop", "--config", str(rig.path)]
+    done = subprocess.run(program, cwd=installed, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert stopped(rig) == ALL
 
 
 def test_what_it_loads_can_be_read_in_a_morning():
