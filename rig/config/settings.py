@@ -157,7 +157,9 @@ class ReadingsSettings(Section):
     """Numbers that a sensor sends, in place of a phone."""
 
     names: tuple[str, ...] = key(
-        "1 to 12; a reading named like an axis rises with it", min_length=1
+        "1 to 12; a reading named like an axis rises with it",
+        min_length=1,
+        max_length=12,
     )
     unit: str = key("of all of them", "mm", min_length=1)
     transport: Literal["tcp", "listen", "udp", "serial", "modbus"] = key(
