@@ -25,7 +25,6 @@ from jaxcal.arms.sensors import (
 )
 
 __all__ = [
-    "ArmCalibration",
     "Board",
     "Chains",
     "Distance",
