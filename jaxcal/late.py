@@ -11,8 +11,8 @@ from typing import Any
 class late:
     """A method that a module further up defines: ``report = late("module:function")``.
 
-    Asked for, of the class or of an object, it is that function; with ``of`` that of
-    the object's attribute of this name.
+    Asked for, of the class or of an object, it is that function, or a class as it is;
+    with ``of`` the function of the object's attribute of this name.
     """
 
     def __init__(self, path: str, of: str = "") -> None:
@@ -26,6 +26,8 @@ class late:
         return function
 
     def __get__(self, instance: Any, owner: type | None = None) -> Callable[..., Any]:
+        if isinstance(self.function, type):
+            return self.function
         if self.of and instance is not None:
             instance = getattr(instance, self.of)
         method: Callable[..., Any] = self.function.__get__(instance, owner)

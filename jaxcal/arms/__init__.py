@@ -3,6 +3,7 @@
 Loaded where an arm is asked for; nothing else of jaxcal loads it.
 """
 
+import importlib
 from typing import Any
 
 from jaxcal.arms.chain import SerialChain
@@ -47,6 +48,4 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name != "ArmCalibration":  # a model of an arm needs no calibration
         raise AttributeError(f"module 'jaxcal.arms' has no attribute {name!r}")
-    from jaxcal.arms.written import ArmCalibration
-
-    return ArmCalibration
+    return importlib.import_module("jaxcal.arms.written").ArmCalibration

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,17 +13,12 @@ from jaxcal.late import late
 from jaxcal.models.model import ErrorGroups, Fitting, as_parameters
 
 
-class _Fitting(Fitting):
-    @property
-    def result_type(self) -> Any:
-        return importlib.import_module("jaxcal.arms.written").ArmCalibration
-
-
-class ArmFitting(_Fitting):
+class ArmFitting(Fitting):
     """What is asked of an arm with its sensor."""
 
     model: Arm
 
+    result_type = late("jaxcal.arms.written:ArmCalibration")
     # Functions of the model, in modules that know it.
     anew = late("jaxcal.arms.plausible:anew", of="model")
     prepared = late("jaxcal.arms.plausible:prepared", of="model")
@@ -134,9 +127,10 @@ class ArmFitting(_Fitting):
         return goal
 
 
-class ChainsFitting(_Fitting):
+class ChainsFitting(Fitting):
     """What is asked of several chains: of each, in its rows."""
 
+    result_type = late("jaxcal.arms.written:ArmCalibration")
     prepared = late("jaxcal.arms.plausible:prepared_chains", of="model")
     verdict = late("jaxcal.arms.verdict:verdict_of_chains", of="model")
 

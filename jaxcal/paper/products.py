@@ -24,7 +24,7 @@ _HEADS = 4
 _READ = 4  # squares that are read from every layer
 _DOUBLINGS = 2  # attention by the squared score to the power 2^2
 _SMALL = 1e-4  # added to squares of order one before their logarithm
-_APART = 1e6  # by which logits outside the whole choice are lower
+_APART = 1e6  # by which logits of the whole choice are higher
 _SCALE = 12.0**0.5  # 1 / standard deviation of uniform commands in [0, 1]
 
 Memory = tuple[jax.Array, jax.Array | None]
@@ -71,7 +71,7 @@ class ProductNetwork(Observing):
         logits = self._logits(x, available, ~available[..., None, :])
         if whole is not None:
             fits = (available | whole).all(-1, keepdims=True)
-            logits = jnp.where(fits & whole & available, 0.0, -_APART) + logits
+            logits = jnp.where(fits & whole & available, _APART, 0.0) + logits
         return logits, jnp.zeros(available.shape[:-1])
 
     def _whole_choice(self, x: jax.Array, k: int) -> jax.Array:

@@ -97,7 +97,7 @@ class Source(abc.ABC):
 
     def turn(self, world: Array) -> None:
         """Turn all readings, those that were received too; of attitudes alone."""
-        raise NotImplementedError  # numbers have no world to turn
+        raise NotImplementedError("numbers have no world to turn")  # of attitudes alone
 
     def store(self, readings: list[Reading]) -> bool:
         """Keep what was accepted, under the lock; whether anything was."""

@@ -749,7 +749,7 @@ def test_a_model_of_ones_own_answers_for_itself(monkeypatch):
     assert not hasattr(calibration, "to_urdf")  # as only of an arm
 
 
-def test_a_hook_that_nobody_asks_is_named():
+def test_a_hook_that_is_not_used_is_named():
     text = "Turning.wrapped is not used: define it in a class derived from .*Fitting"
     with pytest.warns(UserWarning, match=text):
 
