@@ -123,6 +123,8 @@ class Imu(Receiver):
         receiving = asyncio.create_task(way(self._listener))  # which ends with this
         while not (self._closing.is_set() or receiving.done()):
             await asyncio.sleep(LOOK_S)
+        if receiving.done():
+            receiving.result()  # which raises what ended it
 
     async def _datagrams(self, listener: Any) -> None:
         """Lines of datagrams, each of them whole."""

@@ -74,6 +74,7 @@ class Source(abc.ABC):
         self._ring: deque[Reading] = deque(maxlen=RING)
         self._counts: Counter[str] = Counter()
         self._arrived, self._port = 0.0, 0
+        self._ended = ""  # why nothing is received any more
 
     # Of a kind
 
@@ -121,6 +122,8 @@ class Source(abc.ABC):
         """The newest reading; ReadingError where none is fresh."""
         with self._lock:
             reading = self._ring[-1] if self._ring else None
+        if self._ended:
+            raise ReadingError(f"receiving from {self.whose} ended: {self._ended}")
         if reading is None:
             raise ReadingError(f"{self.whose} has sent no reading yet: {self.start}")
         now, limit = time.monotonic(), self.stale_s
@@ -168,6 +171,8 @@ class Source(abc.ABC):
             try:
                 return self.latest()
             except ReadingError:
+                if self._ended:
+                    raise
                 if time.monotonic() > end:
                     detail = self.dropped
                     if self.refused:
@@ -195,8 +200,14 @@ class Receiver(Source):
         self._closing = threading.Event()
         self._listener: socket.socket | None = None  # where this computer is called
         self._thread = threading.Thread(
-            target=self.receive, name=self.table, daemon=True
+            target=self._receive, name=self.table, daemon=True
         )
+
+    def _receive(self) -> None:
+        try:
+            self.receive()
+        except Exception as error:
+            self._ended = f"{type(error).__name__}: {error}"
 
     @abc.abstractmethod
     def receive(self) -> None:

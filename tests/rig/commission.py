@@ -1,10 +1,9 @@
 """A simulated device to commission over the real protocol, and its files."""
 
 import contextlib
-import socket
 
 import numpy as np
-from harness import SPEEDUP, Simulator, fast_config
+from harness import SPEEDUP, Simulator, fast_config, free_port
 from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
@@ -21,11 +20,6 @@ QUICK = (  # of the new rig.toml: short windows, quick axes
     *(f"axes.{name}.{key}" for name in AXIS_NAMES
       for key in ("speed_deg_s=400", "accel_deg_s2=8000", "reduction=10")),
 )  # fmt: skip
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
 
 
 @contextlib.contextmanager

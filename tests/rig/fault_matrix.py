@@ -37,6 +37,7 @@ from harness import (
     changed,
     fast_config,
     fast_text,
+    free_port,
     in_the_middle,
     prove_stops,
     session,
@@ -529,11 +530,6 @@ def _postures(folder: pathlib.Path) -> list[Any]:
     return [record for record in records if record["event"] == "posture"]
 
 
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
-
-
 FIRST_CODES = {
     "sigint": (4, 130),  # 130: in the last phase, with nothing left to pause, it ends
     "sigint_twice": (130,),
@@ -559,7 +555,7 @@ def _host_cell(
     slow = ("other_stop", "foreign_stop", "suspended_stop")
     speedup = 0.3 if fault == "second_session" else 0.1 if fault in slow else 1.0
     with simulator(given, truth=device, speedup=speedup) as sim:
-        served, phone_port = sim.start(), _free_port()
+        served, phone_port = sim.start(), free_port()
         text = fast_text(
             (WATCHED if watched else {})
             | {

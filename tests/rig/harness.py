@@ -7,10 +7,13 @@ something to itself when it enters a phase; the simulator lives in the parent.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import pathlib
+import random
 import resource
 import signal
+import socket
 import sys
 import time
 from unittest import mock
@@ -53,12 +56,23 @@ stop.stand_s = lambda drives: 0.05
 motion.TOO_FAST *= 3.0  # as fast as the simulated drives are
 
 
+def free_port() -> int:
+    """A port of this computer that nobody has, and that nobody is given."""
+    for port in PORTS:
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            return port
+    raise AssertionError("no port is free")
+
+
 def line_here(config, emit):
     """A line without a process of its own: of sessions in the process of a test."""
     return make_drives(config.bus, config.axes, config.silence_s, emit)
 
 
 LINES = line_here  # of sessions in this process; those of commands have their own
+# Below those that systems give out, so that no other test's connection or server gets
+# one of these between its finding here and its use.
+PORTS = itertools.count(random.SystemRandom().randrange(12_000, 30_000))
 RATE_HZ = 250.0
 MODBUS_MAPS = [n for n in available_maps() if isinstance(load_map(n), RegisterMap)]
 SPEEDUP = 3.0  # of the drives over what the configuration says of them

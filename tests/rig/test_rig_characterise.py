@@ -9,8 +9,14 @@ import sys
 import time
 
 import pytest
-from fault_matrix import _free_port
-from harness import Simulator, commissioned, fast_config, fast_text, simulator
+from harness import (
+    Simulator,
+    commissioned,
+    fast_config,
+    fast_text,
+    free_port,
+    simulator,
+)
 
 from rig.config import AXIS_NAMES
 from rig.journal.run_folder import read_journal
@@ -106,7 +112,7 @@ def test_one_that_is_ended_on_the_way_stands_and_begins_anew(tmp_path, number):
 
     Where they then stand was not noted, so they must be homed again.
     """
-    port = _free_port()
+    port = free_port()
     with Simulator(fast_config(), Truth(noise_deg=0.005), rate_hz=250.0) as sim:
         bus = sim.start().bus
         text = fast_text({"port = 5020": f"port = {bus.port}",

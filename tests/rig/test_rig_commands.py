@@ -158,9 +158,9 @@ def test_help_stop_check_and_ports_load_no_heavy_module(tmp_path):
 @pytest.mark.slow
 def test_simulate_serves_a_session_in_another_process(tmp_path):
     """Two programs, as with real hardware: the simulator and the session."""
-    from fault_matrix import _free_port
+    from harness import free_port
 
-    bus, phone = _free_port(), _free_port()
+    bus, phone = free_port(), free_port()
     path = tmp_path / "rig.toml"
     path.write_text(fast_text({"port = 5020": f"port = {bus}",
                                "port = 2055": f"port = {phone}"}))  # fmt: skip

@@ -5,7 +5,6 @@ import contextlib
 import itertools
 import pathlib
 import queue
-import socket
 import struct
 import threading
 import time
@@ -17,6 +16,7 @@ from harness import (
     changed,
     fast_config,
     fast_text,
+    free_port,
     read_words,
     simulator,
 )
@@ -233,10 +233,8 @@ def test_silence_between_frames_is_kept(recorder):
 
 
 def test_a_closed_port_is_one_clear_error():
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
     with pytest.raises(BusError, match="cannot open"):
-        Bus(rtu_over_tcp(port)).open()
+        Bus(rtu_over_tcp(free_port())).open()
     with pytest.raises(BusError, match="no such port"):
         Bus(BusSettings(transport="rtu", device="/dev/does-not-exist")).open()
 

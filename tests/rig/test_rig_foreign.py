@@ -15,8 +15,7 @@ import time
 
 import numpy as np
 import pytest
-from fault_matrix import _free_port
-from harness import commissioned, no_figures
+from harness import commissioned, free_port, no_figures
 from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
@@ -262,7 +261,7 @@ def configured(folder, slave, imu, phone):
 def test_a_whole_calibration_with_a_strangers_slave_and_phone(
     phone, settings, rate, tmp_path, capsys
 ):
-    slave, imu, closing = Slave(), _free_port(), threading.Event()
+    slave, imu, closing = Slave(), free_port(), threading.Event()
     path = configured(tmp_path, slave, imu, settings)
     thread = threading.Thread(
         target=phone, args=(slave, imu, closing, rate), daemon=True
@@ -310,7 +309,7 @@ class Worn:
 @pytest.mark.slow
 def test_a_strangers_worn_axis_is_characterised(tmp_path, capsys):
     """No noise but that of the phone's four digits; nothing of our simulator."""
-    slave, imu, closing = Slave(), _free_port(), threading.Event()
+    slave, imu, closing = Slave(), free_port(), threading.Event()
     path = configured(tmp_path, slave, imu, LINES + QUICK)
     worn = Worn(slave, 0.284, 0.057)
     arguments = (worn, imu, closing, 200)

@@ -17,8 +17,7 @@ import tty
 
 import numpy as np
 import pytest
-from fault_matrix import _free_port
-from harness import commissioned, fast_text, read_words
+from harness import commissioned, fast_text, free_port, read_words
 from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
@@ -125,7 +124,7 @@ def phone(slave, config, port, closing):
 
 @pytest.mark.slow
 def test_a_whole_calibration_over_tcp(program, tmp_path):
-    bus, imu = _free_port(), _free_port()
+    bus, imu = free_port(), free_port()
     text = fast_text(
         {"port = 5020": f"port = {bus}", "port = 2055": f"port = {imu}"},
         session='\n[session]\nmethod = "exact"\nzero = "drive"\n',
@@ -167,7 +166,7 @@ def test_a_whole_calibration_over_tcp(program, tmp_path):
 def test_every_family_enables_moves_and_stops(program, register_map, family):
     """Registers, bits and opcodes of the C program are typed in from the manuals."""
     text = fast_text({'map = "leadshine_pr"': f'map = "{register_map}"'})
-    axis, port = parse_config(text).axes[1], _free_port()
+    axis, port = parse_config(text).axes[1], free_port()
     settings = BusSettings(transport="tcp", host="127.0.0.1", port=port, timeout_s=0.5)
     with Slave(program, "tcp", str(port), family) as slave, Bus(settings) as bus:
         drive = ModbusDrive(bus, axis)

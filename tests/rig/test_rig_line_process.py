@@ -9,8 +9,7 @@ import sys
 import time
 
 import pytest
-from fault_matrix import _free_port
-from harness import fast_config, fast_text, line_here, simulator
+from harness import fast_config, fast_text, free_port, line_here, simulator
 from loaded import modules_of, required_apart
 
 from rig.config import load_config
@@ -71,7 +70,7 @@ def moving_session(tmp_path, changes=SLOW):
     """A session of another process in the middle of a long move."""
     config = fast_config(changes)
     with simulator(config, speedup=1.0) as sim:
-        served, port = sim.start(), _free_port()
+        served, port = sim.start(), free_port()
         path = tmp_path / "given.toml"
         text = fast_text({**changes, "port = 5020": f"port = {served.bus.port}",
                           "port = 2055": f"port = {port}"})  # fmt: skip

@@ -19,7 +19,7 @@ import time
 import harness
 import numpy as np
 import pytest
-from harness import changed, fast_text, simulator
+from harness import changed, fast_text, free_port, simulator
 
 from rig.config import parse_config
 from rig.journal.run_folder import read_journal
@@ -77,15 +77,13 @@ class Rig:
         config = parse_config(fast_text(changes))
         self.sim = simulator(config)
         served = self.sim.start()
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            port = free.getsockname()[1]
-        bus, imu = changed(served.bus), changed(served.imu, port=port)
+        bus, imu = changed(served.bus), changed(served.imu, port=free_port())
         text = fast_text(changes)
         text = text.replace("port = 5020", f"port = {bus.port}")
         text = text.replace("port = 2055", f"port = {imu.port}")
         path = self.folder / "rig.toml"
         path.write_text(text)
-        self.sim.start_phone(port)
+        self.sim.start_phone(imu.port)
         command = [sys.executable, harness.__file__, str(self.folder), str(path)]
         self.session = subprocess.Popen([*command, "none", "none"])
         until(lambda: len(self.records("visit")) >= 1)

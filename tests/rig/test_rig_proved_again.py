@@ -255,7 +255,7 @@ def test_a_drive_that_ignores_its_speed_is_named(factor, at, capsys, monkeypatch
         (at / "rig.toml").write_text(text.replace("_s2 = 8000", "_s2 = 400"))
         code, said = session(capsys)
         assert code == 3, said
-        assert "yaw moves at" in said and "instead of the commanded" in said
+        assert "yaw moves at" in said and "instead of the commanded" in said, said
 
 
 @pytest.mark.slow

@@ -220,9 +220,9 @@ def test_a_loop_that_waited_for_the_line_sends_nothing_after_the_stop():
 @contextlib.contextmanager
 def running_session(sim, tmp_path):
     """`calibrate` in another process, while it moves."""
-    from fault_matrix import _free_port
+    from harness import free_port
 
-    port = _free_port()
+    port = free_port()
     text = sim.path.read_text().replace("port = 2055", f"port = {port}")
     sim.path.write_text(text)
     child = subprocess.Popen(

@@ -344,6 +344,15 @@ def test_a_second_sender_is_refused_reported_and_never_mixed_in(second):
         assert angles_of(imu) == {10.0}
 
 
+def test_receiving_that_ended_is_said_at_once():
+    def full(event, **fields):
+        raise RuntimeError("the journal is full")
+
+    with Imu(changed(PLAIN, port=0, allow=("127.0.0.2",)), full) as imu:
+        with connect(imu), pytest.raises(ReadingError, match="ended: .*journal is full"):
+            imu.wait_for_stream(20.0)
+
+
 def test_only_an_address_that_is_allowed_is_heard():
     settings, told = changed(PLAIN, port=0, allow=("127.0.0.2",)), []
     with Imu(settings, lambda event, **more: told.append(more)) as imu:

@@ -171,11 +171,11 @@ def test_a_drive_that_was_not_seen_to_stand_keeps_its_watch_until_a_resume(tmp_p
 
 @pytest.mark.slow
 def test_a_resumed_run_puts_back_what_a_killed_one_left(tmp_path):
-    from fault_matrix import _free_port
+    from harness import free_port
 
     config = fast_config(WATCHED)
     with watched_simulator(config) as sim:
-        served, port = sim.start(), _free_port()
+        served, port = sim.start(), free_port()
         path = tmp_path / "given.toml"
         path.write_text(fast_text({
             **WATCHED, "port = 5020": f"port = {served.bus.port}",
