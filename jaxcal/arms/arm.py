@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from jaxcal.arms.chain_kernel import forward
+from jaxcal.arms.chain_kernel import forward, slopes
 from jaxcal.arms.sensors import Reading, Sensor, Tip
 from jaxcal.arms.sensors.sensor import BASE, Readings
 from jaxcal.checks import Array, Indices, Mask, array_of, numbers
@@ -29,7 +29,7 @@ _BASE, _ROW, _TOOL = (0, 1, 2, 3, 4, 5, 6), (0, 3, 2, 5, 4), (0, 1, 2, 7, 3, 4, 
 _STILL = 0.02  # of the arm's length: the way of a slide that shows no size
 _PARALLEL, _CANCELS = 0.2, 3.0  # sine; times as long as what is left: lengths cancel
 _SAME = 1e-9  # of lengths and degrees: one and the same link
-_MANY = 2_000  # postures: what is found of so many is not kept
+_MANY = 20_000  # postures: what is found of so many is not kept
 # Where a, alpha, d, theta and beta act among the five steps of a row.
 _ORDER = {"standard": (2, 3, 1, 0, 4), "modified": (0, 1, 4, 3, 2)}
 
@@ -331,14 +331,9 @@ class Arm:
         by the sensor's own parameters."""
         reading = self._reading(commands, parameters)
         frame, axes, origins = self._chain(commands, parameters)
-        motion = np.zeros((len(at), 6, len(commands)))  # shift and turn of the tip
-        turns = self._steps[0][at] > 2
-        about = np.radians(1.0) * axes[at[turns]]
-        motion[turns, :3] = _cross(about, frame[3] - origins[at[turns]])
-        motion[turns, 3:] = about
-        motion[~turns, :3] = axes[at[~turns]]
-        by_steps = np.ascontiguousarray(motion.transpose(2, 1, 0))
-        return reading.by_tip @ by_steps, reading.by_own
+        steps = np.stack([at, self._steps[0][at] > 2], axis=1)
+        by_steps = slopes(frame[3], axes, origins, steps, reading.by_tip)
+        return by_steps, reading.by_own
 
     @_kept
     def _levers(self, commands: Array, parameters: Array) -> tuple[Array, Array]:
@@ -371,46 +366,41 @@ class Arm:
         """(n,)."""
         return np.array([kind == "R" for kind in self.joints])
 
-    def _pulled(self, commands: Array) -> tuple[Array, list[tuple[Array, Array]]]:
-        """The nominal arm's axes (n, 3, N); of each load its force (3,), and how its
-        point moves by each joint (n, 3, N)."""
+    def _pulled(self, commands: Array) -> tuple[Array, Array]:
+        """(n, 3, N) the nominal arm's axes; how far each joint moves what hangs on it,
+        times its weight."""
         stiff = self.nominal
         stiff[self._at["compliance"]] = 0.0
         links = [link for link, _, _ in self.loads]
         _, axes, origins, ends = self._frames(commands, stiff, links)
         axes, origins = axes[self._steps_of_joints], origins[self._steps_of_joints]
-        pulls = []
+        moved = np.zeros_like(axes)
         for (link, weight, centre), end in zip(self.loads, ends, strict=True):
             point = end[3] + np.einsum("k,kcn->cn", centre, end[:3])
-            motion = _cross(axes, point - origins)
-            motion[~self._revolute] = axes[~self._revolute]
-            motion[link:] = 0.0
-            pulls.append((weight * np.array(self.gravity), motion))
-        return axes, pulls
+            motion = _cross(axes[:link], point - origins[:link])
+            slides = ~self._revolute[:link]
+            motion[slides] = axes[:link][slides]
+            moved[:link] += weight * motion
+        return axes, moved
 
     @_kept
     def _torque(self, commands: Array) -> Array:
         """(C, N) torques of the loads on the compliant joints of the nominal arm."""
-        at = np.array(self.compliance) - 1
-        torque = np.zeros((len(at), len(commands)))
-        for force, motion in self._pulled(commands)[1]:
-            torque += np.einsum("c,jcn->jn", force, motion[at])
-        return torque
+        moved = self._pulled(commands)[1][np.array(self.compliance) - 1]
+        return np.asarray(np.einsum("c,jcn->jn", self.gravity, moved))
 
     def _torque_slopes(self, commands: Array) -> Array:
         """(C, n, N) of the torques by the joints, per degree or unit of length.
 
         A torque is the work of the loads per radian, so its derivative is a second one
-        of their positions: ``w_i x J_j``, i before j.
+        of their positions: ``w_i x J_j``, i before j, along gravity.
         """
-        axes, pulls = self._pulled(commands)
+        axes, moved = self._pulled(commands)
         at, joints = np.array(self.compliance)[:, None] - 1, np.arange(len(axes))
         first, second = np.minimum(at, joints), np.maximum(at, joints)
         axes[~self._revolute] = 0.0
-        rate = np.zeros((len(at), len(joints), len(commands)))
-        for force, motion in pulls:
-            bent = _cross(axes[first], motion[second])
-            rate += np.einsum("c,ijcn->ijn", force, bent)
+        across = _cross(np.array(self.gravity)[:, None], axes)
+        rate = np.einsum("ijcn,ijcn->ijn", across[first], moved[second])
         rate[:, self._revolute] = np.radians(rate[:, self._revolute])
         return rate
 

@@ -339,8 +339,10 @@ class SerialChain(Arm, Model):
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         columns, by_sensor = self._motion(commands, theta, self._steps_of_parameters)
         at, own = self._at, self._at["sensor"].start
-        slopes = [columns[..., :own], by_sensor, columns[..., own:]]
-        result = np.concatenate(slopes, axis=-1)
+        result = columns
+        if by_sensor.shape[-1]:
+            parts = [columns[..., :own], by_sensor, columns[..., own:]]
+            result = np.concatenate(parts, axis=-1)
         swing, goes = self._swing(commands, theta)
         if self.gears:
             joints = [i - 1 for i in self.gears]

@@ -11,7 +11,7 @@ import cython
 import numpy as np
 from cython.cimports.libc.math import M_PI, cos, sin
 
-__all__ = ["forward"]
+__all__ = ["forward", "slopes"]
 
 
 def forward(kinds, values, fixed, ends):
@@ -94,3 +94,60 @@ def _forward(
                     first, second = at[one][c], at[two][c]
                     at[one][c] = cosine * first + sine * second
                     at[two][c] = cosine * second - sine * first
+
+
+def slopes(tip, axes, origins, steps, by_tip):
+    """Derivatives of readings by some of the steps of a chain.
+
+    Args:
+        tip: (3, N) the point that is measured.
+        axes, origins: (S, 3, N) of ``forward``.
+        steps: (K, 2) int64: which step, and whether it turns.
+        by_tip: (N, q, 6) of the readings by a shift of the tip, and by its turn in
+            radians.
+
+    Returns:
+        (N, q, K) by a unit of length or a degree of each step.
+    """
+    count, outputs, _ = by_tip.shape
+    result = np.empty((count, outputs, len(steps)))
+    _slopes(tip, axes, origins, steps, np.array(by_tip, order="C"), result)
+    return result
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _slopes(
+    tip: cython.double[:, ::1],
+    axes: cython.double[:, :, ::1],
+    origins: cython.double[:, :, ::1],
+    steps: cython.Py_ssize_t[:, ::1],
+    by_tip: cython.double[:, :, ::1],
+    result: cython.double[:, :, ::1],
+) -> cython.void:
+    # Of a step: its axis and its arm to the tip, or what it shifts and turns.
+    turn = cython.declare(cython.double[3])
+    lever = cython.declare(cython.double[3])
+    shift = cython.declare(cython.double[3])
+    for n in range(by_tip.shape[0]):
+        for k in range(steps.shape[0]):
+            s: cython.Py_ssize_t = steps[k, 0]
+            for c in range(3):
+                turn[c] = axes[s, c, n]
+                if steps[k, 1]:
+                    turn[c] *= M_PI / 180.0
+                lever[c] = tip[c, n] - origins[s, c, n]
+            for c in range(3):
+                after, before = (c + 1) % 3, (c + 2) % 3
+                shift[c] = turn[c]
+                if steps[k, 1]:
+                    shift[c] = turn[after] * lever[before] - turn[before] * lever[after]
+            for i in range(by_tip.shape[1]):
+                slope: cython.double = 0.0
+                for c in range(3):
+                    slope += by_tip[n, i, c] * shift[c]
+                if steps[k, 1]:
+                    for c in range(3):
+                        slope += by_tip[n, i, 3 + c] * turn[c]
+                result[n, i, k] = slope

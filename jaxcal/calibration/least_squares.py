@@ -319,7 +319,8 @@ class FitSolution:
         directions, (R, r) and (r,), where the model is linear."""
         rows, right = self._reduce(damping)
         weight = np.sqrt(self.weights)[:, None]
-        rows = (weight[..., None] * rows).reshape(-1, rows.shape[-1])
+        rows *= weight[..., None]
+        rows = rows.reshape(-1, rows.shape[-1])
         right = (weight * right).ravel()
         if len(self.facts) or self.informed:
             free = self.problem.free
@@ -331,7 +332,8 @@ class FitSolution:
             rows = rows @ self.basis
         scale = np.sqrt((rows**2).sum(axis=0))
         scale = np.where(scale > 0.0, scale, 1.0)
-        return rows / scale, right, scale
+        rows /= scale
+        return rows, right, scale
 
     def step(self) -> bool:
         """Move the parameters to a lower cost; True where they need not move."""
