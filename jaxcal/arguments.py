@@ -130,6 +130,7 @@ class Parser(argparse.ArgumentParser):
             self._correct(words)
         if match := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
             message += f"; write {match[1]}=VALUE if the value begins with a minus"
+        message = re.sub(r"invalid \w+ value: ", "cannot read ", message)
         choice = r"argument (.+): invalid choice: '(.*)' \(choose from (.*)\)"
         if match := re.match(choice, message):
             if like := nearest(match[2], re.findall(r"[^\s',]+", match[3])):

@@ -7,7 +7,21 @@ import signal
 import sys
 from collections.abc import Sequence
 
-if sys.argv[1:2] == ["stop"]:  # nothing may keep it from the drives
+DASHES = "-\u2010\u2011\u2012\u2013\u2014\u2015\u2212"
+
+
+def stop_words(argv: Sequence[str]) -> list[str] | None:
+    """The words around ``stop``, which may be behind options; None: no stop."""
+    argv = [f"-{w.lstrip(DASHES)}" if w.startswith((*DASHES,)) else w for w in argv]
+    words = [word.strip("-!. ").lower() for word in argv]
+    behind = len(words) if argv and argv[0][:1] == "-" else 1
+    if "stop" not in words[:behind] or {"-h", "-help"} & {*argv}:
+        return None
+    place = words.index("stop")
+    return [*argv[:place], *argv[place + 1 :]]
+
+
+if stop_words(sys.argv[1:]) is not None:  # nothing may keep it from the drives
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that is closed meanwhile
 
 
@@ -17,10 +31,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("jaxcal-rig needs Linux or macOS", file=sys.stderr)
         return 2
     argv = sys.argv[1:] if argv is None else list(argv)
-    if argv[:1] == ["stop"] and not {"-h", "--help"} & {*argv}:
+    if (words := stop_words(argv)) is not None:
         from rig import stopping
 
-        return stopping.main(argv[1:])
+        return stopping.main(words)
     from jaxcal.arguments import values_of
     from jaxcal.files import require_kept
     from rig import faults

@@ -13,6 +13,7 @@ import difflib
 import pathlib
 import re
 import tomllib
+import unicodedata
 from collections.abc import Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ from typing import Any
 from rig.registers import FLAGS, FORMATS, Bits, Flags, Frame, Frames, Place, word_of
 from rig.registers import registers_in as count_of
 
+FILE = pathlib.Path("rig.toml")  # without --config
 MAP_FOLDER = pathlib.Path(__file__).parent / "maps"
 HEADER = re.compile(
     r"\s*([\[({][\[({\s]*)?([\"']?[A-Za-z_][\w.\"'-]*)\s*([\])}][\])}\s]*)?"
@@ -32,8 +34,8 @@ ASSIGNMENT = re.compile(
 NOTE = re.compile(r"\s*(;|//)")  # as other formats have them
 APART = re.compile(r"\s*([A-Za-z_]\w*)\s+(\"[^\"]*\"|'[^']*'|[^\s,;#]+)\s*(?:[#,].*)?")
 QUOTES = dict.fromkeys(
-    map(ord, "\u201c\u201d\u201e\u201f\u2018\u2019\u201a\u00ab\u00bb"), '"'
-)
+    map(ord, "\u201c\u201d\u201e\u201f\u2018\u2019\u201a\u00ab\u00bb\u00b4`"), '"'
+) | dict.fromkeys(map(ord, "\u200b\u200c\u200d\u2060\ufeff"))  # of no width
 NUMBER = re.compile(
     r"(?<![\w.])(?:0[xX]\w+|[-+]?\d[\d_]*\.?\d*(?:e[-+]?\d+)?)(?![\w.])"
 )
@@ -55,6 +57,10 @@ FRAMES = (  # of a map, besides its stop
     "move", "home", "hold", "enable", "alarm_reset", "comm_timeout", "limits",
     "set_zero",
 )  # fmt: skip
+OTHER_NAMES = {  # of keys, without lines
+    "host": "hostname ip ipaddress address addr server".split(),
+    "unit": "unitid slave slaveid node nodeid station address id".split(),
+}
 KEYS = {"name", "transport", "host", "device", "parity", "echo", *RANGES, *AXIS}
 Faults = list[str]
 
@@ -100,6 +106,15 @@ class StopConfig:
         return max((axis.map.inter_frame_s for axis in self.axes), default=0.0)
 
 
+def found(path: pathlib.Path) -> pathlib.Path:
+    """A path or, of a folder, its rig.toml, in whatever case its name is written."""
+    with contextlib.suppress(OSError):
+        path = path / FILE if path.is_dir() else path
+        files = [] if path.exists() else path.parent.iterdir()
+        return next((f for f in files if f.name.lower() == path.name.lower()), path)
+    return path
+
+
 def read_file(path: pathlib.Path) -> StopConfig:
     """All that is of use in a configuration file; OSError where it cannot be opened."""
     if path.exists() and not path.is_file():
@@ -132,9 +147,7 @@ def _read(
         if not isinstance(name, str):
             axis_faults.append("it has no name")
             name = f"axis {number}"
-        unit_value = _near(row, "unit")
-        unit_value = row.get("id") if unit_value is None else unit_value
-        unit = int(_number(unit_value, 0, 1, 247, "unit", axis_faults))
+        unit = int(_number(_near(row, "unit"), 0, 1, 247, "unit", axis_faults))
         try:
             drive_map = _map_of(row, maps, folder, axis_faults)
         except Exception as error:  # any fault of a map costs its own axis alone
@@ -167,7 +180,7 @@ def bus_of(table: Any, faults: Faults) -> Bus | None:
             if not isinstance(value, str):
                 faults.append(f"bus.{field.name}: no text, {value!r}")
                 value = default
-            value = value.strip()
+            value = value.strip(" \t\"'()<>[]")
         else:
             low, high = RANGES[field.name]
             value = _number(value, default, low, high, f"bus.{field.name}", faults)
@@ -179,8 +192,7 @@ def bus_of(table: Any, faults: Faults) -> Bus | None:
     bus.host = host[1] if host else bus.host
     bus.parity = bus.parity[:1].upper() if bus.parity[:1].upper() in "NEO" else "N"
     fault = "" if bus.transport in TRANSPORTS else f"not one of {', '.join(TRANSPORTS)}"
-    word = bus.transport.lower()
-    near = difflib.get_close_matches(word, TRANSPORTS, 1, NEAR_NAME)
+    near = difflib.get_close_matches(bus.transport.lower(), TRANSPORTS, 1, NEAR_NAME)
     given, bus.transport = bus.transport, near[0] if near else ""
     if not (bus.host or bus.device):
         faults.append("[bus] has no host and no device")
@@ -205,10 +217,11 @@ def _map_of(
         (name,) = maps
     if folder is None:
         return map_of(name, pathlib.Path(str(row.get("folder", ""))), faults)
-    path = folder / name if name.endswith(".toml") else MAP_FOLDER / f"{name}.toml"
+    custom = name.lower().endswith(".toml")
+    path = found(folder / name if custom else MAP_FOLDER / f"{name}.toml")
     if not path.is_file():
         names = [path.stem for path in MAP_FOLDER.glob("*.toml")]
-        near = difflib.get_close_matches(path.stem, names, 1, NEAR_NAME)
+        near = difflib.get_close_matches(path.stem.lower(), names, 1, NEAR_NAME)
         tried = f"; trying {near[0]}" if near else ""
         faults.append(f"no map {name}{tried}")
         if not near:
@@ -283,10 +296,8 @@ def _frames(table: Any) -> Frames | None:
 
 def _value(table: Any, kind: str) -> Place | None:
     address = _register(table.get("address")) if isinstance(table, dict) else None
-    if address is None:
-        return None
-    kind = str(table.get("type", kind))
-    if kind not in FORMATS:
+    kind = str(_table(table).get("type", kind))
+    if address is None or kind not in FORMATS:
         return None
     function, bits = table.get("function"), table.get("bits")
     return Place(
@@ -326,8 +337,9 @@ def _near(table: dict[str, Any], name: str) -> Any:
     """The value of a key, or of one that is nearly called so."""
     if name in table:
         return table[name]
-    keys = {key.lower(): key for key in table}
+    keys = {re.sub("[_-]", "", key.lower()): key for key in table}
     near = difflib.get_close_matches(name, keys, 1, NEAR)
+    near += [key for key in OTHER_NAMES.get(name, ()) if key in keys]
     return table[keys[near[0]]] if near else None
 
 
@@ -336,7 +348,7 @@ def _number(
 ) -> float:
     """The one number of a value, which may be in a text or a list."""
     try:
-        words = NUMBER.findall(str(value))
+        words = NUMBER.findall(re.sub(r"(?<=\d)[ '](?=\d{3}\b)", "", str(value)))
         (number,) = {float(int(w, 16) if w[:2] in ("0x", "0X") else w) for w in words}
         if low <= number <= high and (isinstance(default, float) or number % 1 == 0):
             return number
@@ -360,7 +372,8 @@ def tables_of(text: str, faults: Faults) -> dict[str, Any]:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         faults.append(f"not valid TOML: {error}")
-    text = re.sub(r",(\s*})", r"\1", text.translate(QUOTES))
+    text = unicodedata.normalize("NFKC", text.translate(QUOTES))
+    text = re.sub(r",(\s*})", r"\1", text)
     root: dict[str, Any] = {}
     table, lines = root, text.splitlines()
     while lines:

@@ -9,6 +9,7 @@ No signal ends this before, and only the standard library and pyserial are loade
 from __future__ import annotations
 
 import contextlib
+import os
 import pathlib
 import signal
 import sys
@@ -21,13 +22,12 @@ from rig.drives import make_drives
 from rig.drives.line import BusError
 from rig.faults import EXIT_FAULT, EXIT_OK, Fault, Refused, told
 from rig.journal.lock import BusLock, armed_files, held_by, read_armed
-from rig.stop_config import StopConfig, read_file
+from rig.stop_config import FILE, StopConfig, found, read_file
 from rig.stop_config import read_armed as config_of
 
 if TYPE_CHECKING:
     from rig.core.stop import UnitStop
 
-FILE = pathlib.Path("rig.toml")  # without --config
 ASK_S = 0.5  # for the holder to have told its drives
 END_S = 2.0  # more for one that has, to write its last lines and end
 KILLED_S = 0.5  # for the kernel to end a process that was killed
@@ -38,20 +38,21 @@ LAST_RESORT = "Use the emergency stop"
 
 
 def main(words: Sequence[str]) -> int:
-    """The command as it is typed; words that it does not know do not keep it."""
-    path, given, rest = FILE, False, list(words)
-    while rest:
-        name, equals, value = rest.pop(0).partition("=")
-        if name[:1] == "-" and "config".startswith(name.lstrip("-") or "?"):
-            value = value if equals else rest.pop(0) if rest else str(FILE)
-        elif name.startswith("-") or given:
-            _say(f"{name}: not an option of stop, ignored")
-            continue
-        else:
-            value = name + equals + value
-        path, given = pathlib.Path(value), True
+    """The command as it is typed: the first of its words that is a file or a folder is
+    the configuration; words that it does not know do not keep it."""
+    paths = []
+    for word in words:
+        if word[:1] == "-":
+            option, _, word = word.partition("=")
+            if not "config".startswith(option.lstrip("-").lower() or "?"):
+                _say(f"{option}: not an option of stop, ignored")
+        paths += [pathlib.Path(word)] * bool(word)
+    existing = [path for path in paths if os.path.exists(found(path))]
+    path = (existing or paths or [FILE])[0]
+    for other in {*paths} - {path}:
+        _say(f"{other}: ignored, the configuration is {path}")
     try:
-        return stop_device(path, given)
+        return stop_device(path, bool(paths))
     except Exception as error:  # whatever it is, the exit code says that drives move
         with contextlib.suppress(OSError, UnicodeError):
             print(f"jaxcal-rig: {told(error)}", file=sys.stderr)
@@ -148,21 +149,10 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
 
 def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
     """The buses to stop; what is wrong with the file is said. Fault: there are none."""
-    targets: list[ArmedBus] = []
-    path = path / FILE if path.is_dir() else path
-    try:
-        config = read_file(path)
-        lack = "; ".join(config.bus_faults)
-        for fault in config.faults:
-            _say(f"{path}: {fault}")
-        if config.bus:
-            targets.append(ArmedBus(config.bus, config))
-        else:
-            lack = f"{path} names no bus"
-    except FileNotFoundError:
-        lack = f"there is no {path}" + " here" * (not given)
-    except Exception as error:  # whatever is wrong, drives are stopped
-        lack = f"{path} cannot be read: {getattr(error, 'strerror', None) or error}"
+    target, lack = _of_file(path)
+    if target is None and given and (target := _of_file(FILE)[0]):
+        _say(f"{lack}: stopping what {FILE} names")
+    targets = [target] if target else []
     every: list[ArmedBus] = []
     with _helping("cannot look at what was armed"):
         every += filter(None, (armed_bus(read_armed(file)) for file in armed_files()))
@@ -183,6 +173,21 @@ def _targets(path: pathlib.Path, given: bool) -> list[ArmedBus]:
     return targets + more or every
 
 
+def _of_file(path: pathlib.Path) -> tuple[ArmedBus | None, str]:
+    """The bus of a file, and what it lacks; what else is wrong with it is said."""
+    try:
+        path = found(path)
+        config = read_file(path)
+        for fault in config.faults:
+            _say(f"{path}: {fault}")
+        if config.bus:
+            return ArmedBus(config.bus, config), "; ".join(config.bus_faults)
+    except Exception as error:  # whatever is wrong, drives are stopped
+        reason = getattr(error, "strerror", None) or error
+        return None, f"{path} cannot be read: {reason}"
+    return None, f"{path} names no bus"
+
+
 def armed_bus(armed: dict[str, Any] | None) -> ArmedBus | None:
     """The bus of what a session left; None where that says nothing of use."""
     with _helping("what a session armed cannot be used"):
@@ -199,7 +204,7 @@ def _tell_others(
         armed = read_armed(path)
         if path in stopped or armed is None or armed["standing"]:
             continue
-        if (target := armed_bus(armed)) is None:
+        if not (target := armed_bus(armed)):
             continue
         holder = target.lock.holder()
         device = f", {armed['device']}" if "device" in armed else ""

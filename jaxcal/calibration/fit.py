@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxcal.calibration.reasons import COARSE, resolution
 from jaxcal.checks import Array, Mask, array_of, numbers
 from jaxcal.information.singular import depends
 from jaxcal.models.identifiability import Identifiability, identifiability
@@ -19,6 +20,8 @@ from jaxcal.models.predictions import derivative, predict
 from jaxcal.models.uncertainty import Prior
 from jaxcal.tables import COMMANDS, MEASURED, of_frame
 
+_FEW = 2000  # rows, among which one may hide
+_CHANCE = 0.0002  # of a table, that a reading lies so far above the others' fit
 FAR = 0.25  # of the range of what was measured, beyond it
 
 
@@ -180,13 +183,18 @@ class Fit:
             at = self.estimated_commands
         return self.residuals + predict(self.whole, at, self.estimate)
 
-    @property
+    @functools.cached_property
     def outliers(self) -> dict[int, float]:
         """Rows too far from the fit of the others (1 % in all) and their weights."""
         from scipy import special
 
         most = special.chdtri(self.num_readings, 0.01 / self.num_measurements)
-        (rows,) = (self.distance > most).nonzero()
+        times, limit = studentised(self)
+        far = (self.distance > most) | (times > limit)
+        if far.any() and not self.noise_known:
+            step = resolution(self.measured, COARSE)
+            far &= (np.abs(deleted(self)) > 2.0 * step).any(axis=1)
+        (rows,) = far.nonzero()
         return {int(i): float(self.loss_weights[i]) for i in rows}
 
     def lack_of_fit(self) -> float | None:
@@ -305,6 +313,36 @@ def linearised(fit: Fit, rows: Array, *, misfit: bool = True) -> tuple[Array, Ar
     by = joint[:p, p:]
     within = joint[:p, :p] - by * fit.prior_precision[p:] @ by.T
     return derivative(fit.model, rows, fit.parameters), within
+
+
+def deleted(fit: Fit) -> Array:
+    """(N, m) residuals from the fit without each measurement, by its mean leverage."""
+    white = (fit.residuals / fit.noise_std) ** 2
+    square = white.sum(axis=1)
+    grown = fit.distance / np.where(square > 0.0, square, np.inf)
+    return np.asarray(fit.residuals * grown[:, None])
+
+
+def studentised(fit: Fit) -> tuple[Array, float]:
+    """(N,) how far each measurement is from the fit of the others, in their noise, and
+    what one in 2,500 such tables reaches: by Student's t of each output, so that no
+    reading hides in the noise that it makes itself. 0 where the noise was given, or
+    rows weigh less than others."""
+    none = np.zeros(len(fit.residuals)), 1.0
+    noise = np.asarray(fit.noise_std)  # 0-d of none
+    exact = fit.noise_known or fit.estimated_commands is not None
+    if exact or noise.ndim == 0 or not noise.all() or len(none[0]) > _FEW:
+        return none
+    dof = fit.dof / len({*noise.tolist()})  # of a level
+    weighed = (fit.loss_weights != 1.0).any() or fit.prior_precision.any()
+    if weighed or dof < 2.0:
+        return none
+    from scipy import special
+
+    square = fit.residuals * deleted(fit) / noise**2
+    share = np.minimum(square / dof, 1.0 - 1e-12).max(axis=1)
+    times = np.sqrt(share * (dof - 1.0) / (1.0 - share))
+    return times, float(-special.stdtrit(dof - 1.0, _CHANCE / square.size))
 
 
 def unseen_directions(fit: Fit) -> Array:

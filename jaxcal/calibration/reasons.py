@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
 _FROZEN = 3  # readings after the first that repeat it
 _STEPS = 20.0  # of a sensor between readings: with fewer, some repeat by chance
+_FINEST, _ROUNDED = 1e-6, 1e-9  # of the largest reading: a sensor's step; its rounding
+COARSE = 50.0  # steps that readings must span to show one
 _EXACT = 1e-12  # of the largest reading: rounding, and no noise of a sensor
 _UNITS = np.outer([1.0, -1.0], [1.0, np.pi / 180.0, 180.0 / np.pi, 1e3, 1e-3]).ravel()
 _NAMED, _DIGITS = 6, 7  # rows in one sentence; decimals of a table
@@ -130,11 +133,30 @@ def _coarse(readings: Array) -> bool:
     return bool(whole and np.median(np.abs(np.diff(readings))) < _STEPS * step)
 
 
+def resolution(readings: Array, least: float = 0.0) -> Array:
+    """(m,) of which differences of readings (N, m) are multiples, by Euclid; 0 where
+    these have more digits than a sensor shows, or lie fewer than ``least`` apart."""
+    size = np.abs(readings).max(axis=0)
+    steps = np.zeros(readings.shape[1])
+    for j in size.nonzero()[0]:
+        for gap in (np.diff(np.unique(readings[:, j])) / size[j]).tolist():
+            while gap > _ROUNDED:
+                steps[j], gap = gap, abs(math.remainder(steps[j], gap))
+            if steps[j] < _FINEST:
+                steps[j] = 0.0
+                break
+    steps *= size
+    return np.where(np.ptp(readings, axis=0) < least * steps, 0.0, steps)
+
+
 def computed(fit: Fit) -> Reason | None:
-    """Readings that a formula made: their residuals are rounding."""
+    """Readings that a formula made: their residuals are rounding, and they have more
+    digits than a sensor."""
     size = np.abs(fit.measured).max(axis=0)
     exact = np.abs(fit.residuals).max(axis=0) <= _EXACT * size
     if fit.dof < 0.5 or not exact.all() or not size.any():
+        return None
+    if resolution(fit.measured)[size > 0.0].all():
         return None
     return Reason(
         "The fit is exact to the last digit: these readings are computed.",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.calibration.fit import linearised, no_noise, noise_of
+from jaxcal.calibration.fit import linearised, no_noise, noise_of, studentised
 from jaxcal.calibration.reasons import (
     Reason,
     computed,
@@ -19,6 +19,7 @@ from jaxcal.calibration.reasons import (
     in_order,
     in_rows,
     never_measured,
+    resolution,
     saturated,
     short,
 )
@@ -38,6 +39,7 @@ _STEP = 0.1  # standard errors, by which another step would move the parameters
 _BENT, _BENT_MORE = 2.0, 3.0  # times the noise without squares and products of the
 # commands; of a model that is a curve itself
 _SAMPLE, _TERMS = 2000, 600  # readings; twice these terms
+_SMOOTH = 16  # rows, of which fewer may be a curve by chance
 _CHECK = "a change of the machine (check, jaxcal check)"
 USE = (
     "use it (command_for, jaxcal command); check it with a few new readings after "
@@ -293,15 +295,13 @@ def _likelier_than_outliers(fit: Fit, distance: Array) -> bool:
 
 
 def bends(fit: Fit) -> Reason | None:
-    """Residuals that follow squares and products of the commands. By an F test of these
-    terms beside the model's own, to first order, where the noise without them is at
-    most half."""
+    """Residuals that follow a curve along the commands: where squares and products, or
+    cubes too, would leave a noise of at most half, by an F test to first order; or
+    where neighbours along a command differ by so little."""
     (count, n), m = fit.commands.shape, fit.measured.shape[1]
     every = max(count * m // _SAMPLE, 1)
-    if count // every <= n * (n + 3) or n * (n + 3) * m > _TERMS:  # twice the terms
+    if count < _SMOOTH and count <= n * (n + 3):  # twice the squares
         return None
-    from scipy import special
-
     noise = np.asarray(fit.noise_std)  # 0-d of none
     if noise.ndim == 0 or not noise.all() or fit.prior_precision.any():
         return None
@@ -310,10 +310,44 @@ def bends(fit: Fit) -> Reason | None:
     i, j = np.triu_indices(n)
     unit = commands - commands.mean(axis=0)
     unit /= np.fmax(np.abs(unit).max(axis=0), 1e-300)
-    terms = np.hstack([unit, unit[:, i] * unit[:, j]])
+    squares = np.hstack([unit, unit[:, i] * unit[:, j]])
+    of_unit = f" {fit.measured_unit}".rstrip()
+    remedy = (
+        "identify with a model that has these terms (Polynomial or another), or "
+        "measure over a smaller range"
+    )
+    for terms, what in (
+        (squares, "squares and products of the commands"),
+        (np.hstack([squares, unit**3]), "squares, products and cubes of the commands"),
+    ):
+        if len(unit) > 2 * terms.shape[1] and 2 * terms.shape[1] * m <= _TERMS:
+            if share := _left_by(fit, sample, terms):
+                return Reason(
+                    f"Residuals follow a curve: of a noise of {each(noise)}{of_unit}, "
+                    f"{what} would leave {each(noise * share)}{of_unit}.",
+                    remedy,
+                )
+    if fit.model.linear and count >= _SMOOTH and (along := _smooth(fit)):
+        output, command = along
+        return Reason(
+            f"Residuals of {fit.output_names[output]} follow a curve along "
+            f"{fit.input_names[command]}: neighbours differ by less than half of the "
+            f"noise of {short(noise[output])}{of_unit}.",
+            "identify with a model that has it, or measure over a smaller range",
+        )
+    return None
+
+
+def _left_by(fit: Fit, sample: slice, terms: Array) -> float:
+    """Share of the noise that terms (N, t) beside the model's would leave; 0 where that
+    is too much, or may be chance."""
+    from scipy import special
+
+    m, noise = fit.num_outputs, np.asarray(fit.noise_std)
     root = np.outer(fit.loss_weights[sample] ** 0.5, 1.0 / noise).ravel()
     white = root * fit.residuals[sample].ravel()
-    slopes = linearised(fit, commands, misfit=False)[0].reshape(len(white), -1)
+    slopes = linearised(fit, fit.commands[sample], misfit=False)[0]
+    slopes = slopes.reshape(len(white), -1)
     both = np.hstack([slopes, np.kron(terms, np.eye(m))])
 
     def unexplained(columns: Array) -> tuple[float, int]:
@@ -324,26 +358,41 @@ def bends(fit: Fit) -> Reason | None:
     (before, more), (after, rest) = unexplained(slopes), unexplained(both)
     least = _BENT if fit.model.linear else _BENT_MORE
     if rest < 1 or more == rest or least**2 * after / rest > before / more:
-        return None
+        return 0.0
     ratio = (before - after) / (more - rest) / (after / rest)
     # As of one output: the outputs of a row may err alike.
-    if special.fdtrc((more - rest) / m, rest / m, ratio) > UNLIKELY:
-        return None
-    of_unit = f" {fit.measured_unit}".rstrip()
-    return Reason(
-        f"Residuals follow a curve: of a noise of {each(noise)}{of_unit}, squares and "
-        f"products of the commands would leave {each(noise * (after / rest) ** 0.5)}"
-        f"{of_unit}.",
-        "identify with a model that has these terms (Polynomial or another), or "
-        "measure over a smaller range",
-    )
+    chance = special.fdtrc((more - rest) / m, rest / m, ratio)
+    return float((after / rest) ** 0.5) if chance <= UNLIKELY else 0.0
+
+
+def _smooth(fit: Fit) -> tuple[int, int] | None:
+    """The output and the command along which residuals are a curve: neighbours differ
+    by half of their noise or less (von Neumann, 1941)."""
+    from scipy import special
+
+    used = fit.loss_weights > 0.0
+    count, residuals = int(used.sum()), fit.residuals[used]
+    # What a display rounded, or a computer, follows a pattern of its own.
+    residuals = residuals * (fit.noise_std > resolution(fit.measured))
+    least, along = 0.5, None
+    for k in range(fit.num_inputs):
+        order = np.argsort(fit.commands[used, k], kind="stable")
+        steps = np.diff(residuals[order], axis=0)
+        square = 2.0 * (residuals**2).sum(axis=0)
+        ratio = np.full(len(square), np.inf)
+        np.divide((steps**2).sum(axis=0), square, ratio, where=square > 0.0)
+        j = int(ratio.argmin())
+        chance = special.ndtr((ratio[j] - 1.0) * np.sqrt(count))
+        if ratio[j] <= least**2 and chance * ratio.size * fit.num_inputs <= UNLIKELY:
+            least, along = float(ratio[j] ** 0.5), (j, k)
+    return along
 
 
 def outlying(fit: Fit, rows: Sequence[int]) -> Reason | None:
     """Rows that are far from the fit of the others."""
     if not rows:
         return None
-    sigma = np.sqrt(fit.distance[list(rows)])
+    sigma = np.fmax(np.sqrt(fit.distance), studentised(fit)[0])[list(rows)]
     size = " to ".join(dict.fromkeys(f"{end:.2g}" for end in (min(sigma), max(sigma))))
     verb = "are outliers" if len(rows) > 1 else "is an outlier"
     named = in_rows(rows)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import sys
+from argparse import ArgumentTypeError
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from jaxcal.arguments import Numbers, Was, several
+from jaxcal.arguments import Numbers, Was, number_type, several
 from jaxcal.calibration import Calibration
 from jaxcal.calibration import identify as identified
 from jaxcal.checks import Array
@@ -160,6 +162,7 @@ def commands_for(
     model: Any = calibration.model
     if radians and not is_arm(model):
         raise ValueError("--radians needs an arm")
+    table.say_available()
     names = table.named(
         calibration.input_names,
         COMMANDS,
@@ -168,15 +171,35 @@ def commands_for(
         unit=calibration.command_unit,
         others=calibration.output_names,
     )
+    table.require_units(names, input_units(model, calibration.command_unit, radians))
     commands = table.columns(names, None, getattr(model, "levels", ()))
     return names, in_degrees(model, commands) if radians else commands
 
 
+def input_units(model: Any, unit: str, radians: bool = False) -> list[str]:
+    """Units of the commands of a model, of an arm those of its joints; "" is any."""
+    if not is_arm(model):
+        return [unit]
+    turning, sliding = "rad" if radians else "deg", model.length_unit("")
+    units = [turning if kind == "deg" else sliding for kind in model.command_units]
+    return units + [""] * len(model.sensor.inputs)
+
+
+def output_units(model: Any, unit: str) -> list[str]:
+    """Units of the readings of a model, of an arm lengths and turns; "" is any."""
+    if not is_arm(model):
+        return [unit]
+    units = [""] * model.num_outputs
+    for quantity in model.quantities(unit):
+        if quantity.unit in ("deg", model.length_unit(unit)):
+            units[quantity.columns] = [quantity.unit] * len(units[quantity.columns])
+    return units
+
+
 def is_arm(model: Any) -> bool:
     """Whether a model is an arm, of which some options are."""
-    from jaxcal.arms import SerialChain
-
-    return isinstance(model, SerialChain)
+    arms = sys.modules.get("jaxcal.arms.chain")  # loaded with the first arm
+    return arms is not None and isinstance(model, arms.SerialChain)
 
 
 @dataclasses.dataclass
@@ -208,10 +231,13 @@ RecordPath = Annotated[
 
 def _by_unit(text: str) -> float | dict[str, float]:
     """A number, or numbers of units: mm=0.5,deg=0.1."""
+    number = number_type(float)
     if "=" not in text:
-        return float(text)
-    pairs = (part.rpartition("=") for part in text.split(","))
-    return {unit.strip(): float(value) for unit, _, value in pairs}
+        return number(text)
+    pairs = [part.rpartition("=") for part in text.split(",")]
+    if not all(unit.strip() for unit, _, _ in pairs):
+        raise ArgumentTypeError(f"must be UNIT=NUMBER,UNIT=NUMBER, got {text!r}")
+    return {unit.strip(): number(value) for unit, _, value in pairs}
 
 
 def identify(
@@ -263,11 +289,15 @@ def identify(
     machine: Any = of_arm.machine(model, table)
     if accuracy is not None and not is_arm(machine):
         raise ValueError("--accuracy needs an arm: --model FILE.urdf")
+    table.say_available(of_noise.weights, session)
+    beside = [name for name in (of_noise.weights, session) if name]
     commands, measured, names, columns = _readings(
-        of_arm, machine, table, inputs, outputs, of_noise.weights, of_urdf=of_urdf
+        of_arm, machine, table, inputs, outputs, beside, of_urdf=of_urdf
     )
     if of_urdf and machine.sensor.lengths:  # files of this format are in metres
         measured_unit = measured_unit or "m"
+    table.require_units(names, input_units(machine, command_unit, of_arm.radians))
+    table.require_units(columns, output_units(machine, measured_unit))
     calibration = identified(
         commands,
         measured,
@@ -279,7 +309,7 @@ def identify(
         command_unit=command_unit,
         measured_unit=measured_unit,
         accuracy=accuracy,
-        sessions=table.columns([session])[:, 0] if session else None,
+        sessions=table.keys(session) if session else None,
     )
     lines = saved.written(calibration, recording.servos)
     if saved.repair:
@@ -329,19 +359,26 @@ def _readings(
     table: Table,
     inputs: str | None,
     outputs: str | None,
-    weights: str | None,
+    beside: Sequence[str],
     *,
     of_urdf: bool,
 ) -> tuple[Array, Array, Sequence[str], Sequence[str]]:
     """Commands (N, n), readings (N, m) and their columns: u_ and y_, or those named;
-    ``of_urdf``: as the arm's joints and its sensor's; contacts have none."""
+    ``of_urdf``: as the arm's joints and its sensor's; contacts have none. ``beside``:
+    columns that hold something else."""
     contacts = of_urdf and machine.sensor.contacts
     if contacts and outputs:
         raise ValueError(f"contacts have no readings: leave out --outputs {outputs}")
     columns = machine.sensor.outputs if of_urdf else table.outputs(outputs)
     if of_urdf and not contacts:
-        columns = table.named(columns, MEASURED, chosen=outputs, option="--outputs")
-    names = of_arm.columns(machine, table, inputs, (*columns, weights or ""))
+        columns = table.named(
+            columns,
+            MEASURED,
+            chosen=outputs,
+            option="--outputs",
+            others=table.without(MEASURED),
+        )
+    names = of_arm.columns(machine, table, inputs, (*columns, *beside))
     commands = of_arm.commands(machine, table, names)
     if contacts:
         measured = np.zeros((len(table), len(columns)))
@@ -391,9 +428,15 @@ def check(
     if getattr(getattr(calibrated.model, "sensor", None), "contacts", False):
         measured = np.zeros((len(commands), calibrated.num_outputs))
     else:
+        unit = calibrated.measured_unit
         outputs = table.named(
-            calibrated.output_names, MEASURED, option="", unit=calibrated.measured_unit
+            calibrated.output_names,
+            MEASURED,
+            option="",
+            unit=unit,
+            others=table.without(MEASURED),
         )
+        table.require_units(outputs, output_units(calibrated.model, unit))
         if both := sorted({*inputs} & {*outputs}):
             raise ValueError(
                 f"{table.source}: {', '.join(both)} would be both commands and "
@@ -461,6 +504,7 @@ def command(
     """
     calibrated = Calibration.load(calibration)
     table, unit = read_table(file), calibrated.measured_unit
+    table.say_available()
     names = table.named(
         calibrated.output_names,
         MEASURED,
@@ -469,6 +513,7 @@ def command(
         unit=unit,
         others=calibrated.input_names,
     )
+    table.require_units(names, output_units(calibrated.model, unit))
     desired = table.columns(names)
     if clip and not limits:
         raise ValueError("--clip needs --limits")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
@@ -24,6 +25,8 @@ UNIT = re.compile(
     r"|degrees?|radians?|volts?|sec|seconds?|T|S|Ohm|ppm|dB|lx|px|LSB|mmHg|RH|rev"
     r"|arcsec|arcmin|a\.u\.|ε))+"
 )
+_SHORT = {"degree": "deg", "radian": "rad", "volt": "V", "second": "s", "sec": "s"}
+_SHORT |= {"inch": "in", "count": "ct"} | {x: x for x in ("deg", "rad", "ct", "rev")}
 _FORTRAN = re.compile(r"[+-]?\d*\.?\d+\.?[dD][+-]?\d+")
 _LEAST = 100.0  # a whole number beside 14.036 that makes that one doubtful
 _OTHER = {".": ",", ",": "."}
@@ -53,6 +56,13 @@ def has_unit(cells: Sequence[str]) -> bool:
     unit = units.pop()
     sure = len(unit) > 1 or unit in "%°" or not {*".,"}.isdisjoint("".join(cells))
     return not units and sure and UNIT.fullmatch(unit) is not None
+
+
+def unit_of(text: str) -> str:
+    """A unit as any other spelling of it: "deg" of "[°]" and "degrees"."""
+    text = unicodedata.normalize("NFKC", text).strip(" -[]()").replace("°", "deg")
+    text = re.sub(r"[\s.·*^]", "", text.replace("\u03bc", "u"))
+    return _SHORT.get(text.lower().removesuffix("s") or text, text)
 
 
 def decimal_mark(cells: Sequence[str], semicolons: bool) -> tuple[str, bool]:

@@ -38,9 +38,13 @@ _STAMPS = {"stamp", "timestamp", "date", "datetime", "epoch", "datum"}
 _TIMES = {"time", "uhrzeit", "elapsed", "clock"}
 # T alone is a temperature.
 _SECONDS = re.compile(r"t|[tT][ _]?[\[(]?(s|ms|us|ns|sec|seconds|min)[\])]?")
+_LIKE_COUNT = "may be a time or a row number: it {}; if so, leave it out"
 _MARKS = "holds 0 and 1; if it says which rows may be chosen, name it available"
 COUNTED = "like a row number or a time"
-_LIKE_U, _LIKE_Y = re.compile(r"[uU]\d*|U_.*"), re.compile(r"[yY]\d*|Y_.*")
+_LIKE_U, _LIKE_Y = (  # u1, U_pitch, u[0]
+    re.compile(rf"[{letter}](\d*|[\[(]\d+[\])]|_.*)") for letter in ("uU", "yY")
+)
+_GAPS = 1.25  # of the numbers in a range to the rows that hold them
 _EPOCH = 1e8  # seconds; no factor of an experiment is so large
 
 
@@ -182,6 +186,13 @@ def _counting(table: Any, decisions: dict[str, Decision]) -> dict[str, Decision]
             for name, mark in zip(names, marks, strict=True)
             if mark and not decisions[name].reason
         }
+    doubts = [_doubt(column) for column in columns]
+    if None in doubts:
+        counting |= {
+            name: Decision("input", _LIKE_COUNT.format(doubt))
+            for name, doubt in zip(names, doubts, strict=True)
+            if doubt and name not in counting and not decisions[name].reason
+        }
     return counting
 
 
@@ -202,6 +213,20 @@ def _count(column: Array) -> str | None:
                 f"holds each number from {first:g} to {count - 1 + first:g} once, like "
                 "a row number"
             )
+    return None
+
+
+def _doubt(column: Array) -> str | None:
+    """In which way a column is like an uneven time or a row number with gaps."""
+    numbers = column[np.isfinite(column)]
+    count = len(numbers)
+    if count < _LEAST_ROWS or numbers.min() < 0.0:
+        return None
+    if (np.diff(numbers) > 0.0).all():
+        return "rises in every row"
+    whole = (numbers == np.round(numbers)).all() and len(np.unique(numbers)) == count
+    if whole and count >= 2 * _LEAST_ROWS and np.ptp(numbers) < _GAPS * count:
+        return "holds different whole numbers, few of them missing"
     return None
 
 

@@ -73,7 +73,7 @@ def parse(source: str, data: bytes) -> Table:
 
 def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
     """The table in a text, and what is to be said of how it was read."""
-    rows, delimiter, headed, notes = sheet_of(source, text)
+    rows, delimiter, headed, units, notes = sheet_of(source, text)
     _, header = rows[0]
     mark = decimal_mark([cell for _, row in rows for cell in row], delimiter != ",")
     if not headed:
@@ -97,7 +97,8 @@ def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
         elif any(cells):
             notes += _unnamed(source, place, cells, columns)
     lines = tuple(line for line, _ in rows)
-    table = table_of(source, columns, lines, mark, headed=headed)
+    named = dict(zip(header, units, strict=False))
+    table = table_of(source, columns, lines, mark, headed=headed, units=named)
     if not table.names:
         raise ValueError(f"{source}: no column contains numbers: {', '.join(header)}")
     return table, notes
@@ -160,12 +161,12 @@ def decoded(source: str, data: bytes) -> tuple[str, str]:
 
 def sheet_of(
     source: str, text: str
-) -> tuple[list[tuple[int, list[str]]], str, bool, list[str]]:
-    """Rows of a text, line and as many cells each, its comments and its row of units
-    left out; the delimiter; whether the first row holds names; what is to be said."""
+) -> tuple[list[tuple[int, list[str]]], str, bool, list[str], list[str]]:
+    """Rows of a text, line and as many cells each, without comments and row of units;
+    the delimiter; whether the first row holds names; the units; what is to be said."""
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     notes: list[str] = []
-    stated = re.fullmatch(r"\"?sep=(.)\"?", lines[0].strip())
+    stated = re.fullmatch(r"\"?sep=(.)\"?\s*", lines[0].lstrip(), re.IGNORECASE)
     if stated:
         lines[0] = ""
     lines, comment = _without_comments(lines, notes)
@@ -182,11 +183,12 @@ def sheet_of(
                 rows.insert(0, (line, names))
                 break
     headed = not all(map(is_number, rows[0][1]))
+    units: list[str] = []
     if headed and len(rows) > 2 and _holds_units(rows[1][1], rows[2:]):
-        units = ", ".join(filter(None, rows[1][1]))
-        notes.append(f"units are taken from line {rows[1][0]}: {units}")
-        del rows[1]
-    return rows, delimiter, headed, notes
+        line, units = rows.pop(1)
+        listed = ", ".join(filter(None, units))
+        notes.append(f"units are taken from line {line}: {listed}")
+    return rows, delimiter, headed, units, notes
 
 
 def _without_comments(

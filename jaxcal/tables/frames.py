@@ -14,6 +14,7 @@ from jaxcal.tables.decisions import (
     MEASURED,
     columns_by_name,
     decide,
+    is_available,
     say,
 )
 from jaxcal.tables.table import Table, table_of
@@ -105,15 +106,25 @@ def _column(values: Any, name: str) -> Any:
             return values.labels[name]
         return values.values[:, values.names.index(name)]
     if hasattr(values, "_fields"):
-        return getattr(values, name)
+        return _unmasked(getattr(values, name))
     if isinstance(values, list | tuple):
         return [_column(row, name) for row in values]
     if _is_labelled(values) or not hasattr(values, "__getitem__"):
         return np.asarray(values)[..., _names(values).index(name)]
     try:
-        return values[name]
+        return _unmasked(values[name])
     except KeyError:
         raise ValueError(f"a row lacks {name!r}") from None
+
+
+def _unmasked(column: Any) -> Any:
+    """The column, its masked values made NaN or None."""
+    if not isinstance(column, np.ma.MaskedArray):
+        return column
+    values, masked = np.ma.getdata(column), np.ma.getmaskarray(column)
+    if values.dtype.kind in "iuf":
+        return np.where(masked, np.nan, values)
+    return np.where(masked, np.array(None), values.astype(object))
 
 
 def _shape(column: Any) -> tuple[int, ...]:
@@ -174,13 +185,18 @@ def of_frame(
         numbers = {
             name: column
             for name, column in every.items()
-            if isinstance(column, np.ndarray) and len(column) == len(cells[0])
+            if isinstance(column, np.ndarray) or is_available(name)
+            if len(column) == len(cells[0])
         }
         of_numbers = table_of(argument, numbers, range(len(cells[0])), None, row="row")
+        of_numbers.say_available()
         if spare := of_numbers.unread(names, prefix, beside):
             say(f"{argument}: {spare}")
     table = table_of(argument, named, range(math.prod(shape)), None, row="row")
     used = None if used is None else np.asarray(used)
+    if used is not None:  # what is no mask is refused elsewhere
+        valid = used.dtype.kind in "biuf" and used.shape in ((1,), (len(table),))
+        used = used.astype(bool) if valid else np.zeros(1, dtype=bool)
     values = table.columns(names, used, levels).reshape(*shape, len(names))
     if any(isinstance(column, list) for column in cells):
         return values
@@ -243,8 +259,8 @@ def names_in(
             f"{wanted[names.index(None)]!r} is missing (columns: {', '.join(header)})"
         )
     if beside is not None:
-        spare = table_of_frame(argument, frame).unread(names, prefix, beside)
-        if spare:
+        table = _all_rows(argument, frame)
+        if spare := table.unread(names, prefix, beside):
             say(f"{argument}: {spare}")
     return tuple(names)
 
@@ -315,7 +331,15 @@ def inputs_of(argument: str, frame: Any, outputs: Sequence[str] = ()) -> Any:
     names."""
     if not header_of(argument, frame):
         return None
-    return table_of_frame(argument, frame).commands(None, None, outputs)
+    return _all_rows(argument, frame).commands(None, None, outputs)
+
+
+def _all_rows(argument: str, frame: Any) -> Table:
+    """The table of a frame, whose rows all count unless they are candidates."""
+    table = table_of_frame(argument, frame)
+    if argument != "candidates":
+        table.say_available()
+    return table
 
 
 def outputs_of(argument: str, frame: Any, beside: bool) -> Any:

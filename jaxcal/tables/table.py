@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxcal.checks import Array, Mask
-from jaxcal.tables.cells import ambiguous, decimal_mark, number_of, truths_of
+from jaxcal.tables.cells import ambiguous, decimal_mark, number_of, truths_of, unit_of
 from jaxcal.tables.decisions import (
     AVAILABLE,
     COMMANDS,
@@ -39,6 +39,7 @@ class Table:
     lines: tuple[int, ...]  # of the file, or rows of a frame, one for each row
     headed: bool = True  # False: there is no header, the names are u_x, u_y, u_z
     row: str = "line"  # what ``lines`` counts
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)  # as written
 
     def __len__(self) -> int:
         return len(self.values)
@@ -169,6 +170,18 @@ class Table:
         self.say(columns, spare)
         return tuple(columns)
 
+    def require_units(self, columns: Sequence[str], units: Sequence[str]) -> None:
+        """Refuse columns whose row of units says another than these, or than the only
+        one; "" is any."""
+        units = [*units] * len(columns) if len(units) == 1 else units
+        for name, unit in zip(columns, units, strict=True):
+            stated = self.units.get(name, "")
+            if unit and unit_of(stated) not in ("", unit_of(unit)):
+                raise ValueError(
+                    f"{self.source}: column {name!r} is in {stated}, by its row of "
+                    f"units, and must be in {unit}: convert it, or correct that row"
+                )
+
     def commands(
         self,
         chosen: str | None,
@@ -243,20 +256,44 @@ class Table:
             raise ValueError(f"{self.source}: columns {both} could both be {AVAILABLE}")
         if not names:
             return None
-        cells = self.labels.get(names[0])
-        if cells is None:
-            numbers = self.values[:, self.names.index(names[0])].tolist()
-            words = [f"{x:g}" if x == x else "an empty cell" for x in numbers]
-        else:
-            words = [repr(cell) for cell in cells]
-            numbers = [(truths_of([cell]) or [np.nan])[0] for cell in cells]
-        for line, word, number in zip(self.lines, words, numbers, strict=True):
+        cells = self._words(names[0])
+        numbers = [(truths_of([cell]) or [np.nan])[0] for cell in cells]
+        for line, cell, number in zip(self.lines, cells, numbers, strict=True):
             if number not in (0.0, 1.0):
                 raise ValueError(
                     f"{self.source}: {self.row} {line}, {names[0]} must be 1 or 0, "
-                    f"TRUE or FALSE, or yes or no, got {word}"
+                    f"TRUE or FALSE, or yes or no, got {cell or 'an empty cell'}"
                 )
         return np.array(numbers) == 1.0
+
+    def _words(self, name: str) -> list[str]:
+        """(N,) the cells of a column as words, numbers as well; "" where empty."""
+        if name in self.labels:
+            return self.labels[name]
+        numbers = self.values[:, self.names.index(name)].tolist()
+        return [f"{x:g}" if x == x else "" for x in numbers]
+
+    def keys(self, name: str) -> list[str] | Array:
+        """(N,) the words of a column, or its numbers; none may be missing."""
+        if name not in self.labels:
+            return self.columns([name])[:, 0]
+        for line, cell in zip(self.lines, self.labels[name], strict=True):
+            if not cell:
+                raise ValueError(
+                    f"{self.source}: {self.row} {line}, column {name!r} is empty"
+                )
+        return self.labels[name]
+
+    def say_available(self, *read: str | None) -> None:
+        """Say that rows are used whose column ``available`` holds 0; ``read``: columns
+        that are read as something else."""
+        for name in filter(is_available, self.header):
+            zeros = (truths_of(self._words(name)) or []).count(0.0)
+            if zeros and name not in read:
+                say(
+                    f"{self.source}: column {name!r} is not read here: all rows are "
+                    f"used, {zeros} of them with 0"
+                )
 
     def say(self, columns: Sequence[Any], more: str = "") -> None:
         """Say where columns stand in another order than is asked for, and ``more``."""
@@ -264,6 +301,10 @@ class Table:
         moved = "" if order == [*columns] else "columns reordered by name"
         if parts := [*filter(None, [moved, more])]:
             say(f"{self.source}: {'; '.join(parts)}")
+
+    def without(self, prefix: str) -> list[str]:
+        """Names of the columns that lack the prefix."""
+        return [name for name in self.header if not name.startswith(prefix)]
 
     def bare(self, prefix: str) -> list[str]:
         """Names of all columns without the prefix."""
@@ -284,18 +325,21 @@ class Table:
     def unread(
         self, columns: Sequence[str], prefix: str, others: Collection[str]
     ) -> str:
-        """Which columns of numbers are neither these nor ``others``, in words."""
+        """Which columns are neither these nor ``others``, in words."""
         other = COMMANDS if prefix == MEASURED else MEASURED
         beside = {*columns, *columns_by_name([*others], self.header, other)}
         decisions = decide(self, {*columns})
-        spare = [
-            name
-            for name in self.names
-            if not (name in beside or name.startswith(other))
-            and decisions[name].reason != COUNTED
-            and decisions[name].role != AVAILABLE
-        ]
-        return listed(spare, "ignored (not needed)") if spare else ""
+        groups: dict[str, list[str]] = {}
+        for name in self.header:
+            role, reason, _ = decisions[name]
+            spare = not (name in beside or name.startswith(other))
+            if spare and reason != COUNTED and role != AVAILABLE:
+                of_words = name in self.labels
+                what = (
+                    f"read as label: {reason}" if of_words else "ignored (not needed)"
+                )
+                groups.setdefault(what, []).append(name)
+        return "; ".join(listed(names, what) for what, names in groups.items())
 
 
 def table_of(
@@ -306,6 +350,7 @@ def table_of(
     *,
     headed: bool = True,
     row: str = "line",
+    units: Mapping[str, str] | None = None,
 ) -> Table:
     """The table of columns of cells, or of numbers (N,).
 
@@ -342,7 +387,9 @@ def table_of(
             table.labels[name] = [*cells]
     values = np.array([*numeric.values()], dtype=np.float64)
     values = values.reshape(len(numeric), len(lines)).T
-    return dataclasses.replace(table, names=tuple(numeric), values=values)
+    return dataclasses.replace(
+        table, names=tuple(numeric), values=values, units=units or {}
+    )
 
 
 def _places(

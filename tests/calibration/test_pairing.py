@@ -194,6 +194,92 @@ def test_the_mended_table_is_the_right_one():
         sessions.repaired(u[:20], y[:20])
 
 
+@pytest.mark.parametrize("kind", ["lost", "doubled", "a command lost"])
+def test_a_mended_table_holds_no_pair_that_was_none(kind):
+    for seed in range(10):
+        u, y = _table(seed)
+        truth = {
+            tuple(reading): tuple(command)
+            for command, reading in zip(u, y, strict=True)
+        }
+        spoilt = SPOILT[kind][0](u, y)
+        commands, measured = _verdict(*spoilt).mispairing.repaired(*spoilt)
+        pairs = [*zip(map(tuple, commands), map(tuple, measured), strict=True)]
+        assert all(truth[reading] == command for command, reading in pairs), seed
+        assert len({command for command, _ in pairs}) == len(pairs) >= 17, seed
+
+
+def test_a_table_of_two_explanations_is_not_mended():
+    u, y = _table()
+    spoilt = u[:20], np.roll(y[:20], 1, axis=0)
+    found = _verdict(*spoilt).mispairing
+    assert found.alternatives
+    with pytest.raises(ValueError, match="not repaired, for it is not known how"):
+        found.repaired(*spoilt)
+
+
+def _recording(seed, count, bend=0.0):
+    rng = np.random.default_rng(seed)
+    time, phase = 0.1 * np.arange(count), rng.uniform(0.0, 6.0, 3)
+    u = np.stack([9.0 * np.sin(r * time + p) + 2.0 * np.cos(3.1 * r * time)
+                  for r, p in zip((1.0, 1.3, 0.7), phase, strict=True)], 1)  # fmt: skip
+    y = u @ MATRIX.T + BIAS + bend * u[:, [1, 0, 1]] * u / 10.0
+    return u, y + NOISE * rng.normal(size=u.shape)
+
+
+@pytest.mark.parametrize("by, bend", [(1, 0.0), (2, 0.0), (0, 0.3), (0, 0.0)])
+def test_a_lag_of_a_short_smooth_recording_is_no_curve(by, bend):
+    for seed in range(8):
+        u, y = _recording(seed, 40, bend)
+        reasons = str(_verdict(u[by:], y[: len(y) - by]).verdict)
+        assert ("all readings are" in reasons) == (by > 0), (seed, reasons)
+        assert ("follow a curve" in reasons) == (bend > 0.0), (seed, reasons)
+
+
+def _column_lost(u, y):
+    return u[:-1], np.column_stack([y[:-1, 0], np.delete(y[:, 1], 9), y[:-1, 2]])
+
+
+def _column_sorted(u, y):
+    return u, np.column_stack([y[:, 0], np.sort(y[:, 1]), y[:, 2]])
+
+
+def _column_late(u, y):
+    return u[3:], np.column_stack([y[3:, 0], y[:-3, 1], y[3:, 2]])
+
+
+@pytest.mark.parametrize(
+    "spoil, table, words",
+    [
+        (_column_lost, _table, "y_y alone: from row 9 "),
+        (_column_sorted, _table, "y_y alone: the readings are sorted"),
+        (_column_late, _recording, "y_y alone: all readings are 3 rows late"),
+        (lambda u, y: (u, y), _table, ""),
+        (lambda u, y: (u, y), _recording, ""),
+    ],
+)
+def test_one_output_that_was_moved_is_named(spoil, table, words):
+    for seed in range(8):
+        fit = _verdict(*spoil(*table(seed, 60)))
+        assert (fit.mispairing is None) == (not words), seed
+        assert not words or words in fit.verdict.reasons[0], fit.verdict.reasons
+        if words:
+            assert "--repair" not in fit.verdict.next_step
+            with pytest.raises(ValueError, match="one column cannot be repaired"):
+                fit.mispairing.repaired(fit.commands, fit.measured)
+
+
+def test_three_sessions_are_told_and_no_drift_that_turns_is():
+    for seed in range(10):
+        u, y = (side[:24] for side in _table(seed))
+        steps = np.repeat([[0, 0, 0], [1, -1, 0.5], [-1, 0.6, 2]], 8, axis=0)
+        reason = _verdict(u, y + steps).verdict.reasons[0]
+        assert "three sessions: from row 8 on and from row 16 on" in reason
+        u, y = _table(seed, 60)
+        turns = np.sin(np.linspace(0.0, 9.0, len(u)) + seed)[:, None] * (0.3, 0.2, 0.1)
+        assert _verdict(u, y + turns).mispairing is None
+
+
 def test_a_check_names_columns_and_rows():
     u, y = _table()
     fit = jaxcal.identify(u[:20], y[:20])

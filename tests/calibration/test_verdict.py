@@ -598,3 +598,56 @@ def test_a_coarse_sensor_on_a_plateau_did_not_freeze():
         warnings.simplefilter("ignore", UserWarning)
         verdict = jaxcal.identify(u, y, model=jaxcal.models.Polynomial(3, 1)).verdict
     assert "froze" not in str(verdict)
+
+
+def _plane(rng, count, outputs, noise=0.05):
+    u = rng.uniform(-20.0, 20.0, (count, 2))
+    gain = 0.1 * rng.normal(size=(2, outputs))
+    gain[:, :2] += np.eye(2)
+    return u, u @ gain + 1.0 + rng.normal(0.0, noise, (count, outputs))
+
+
+@pytest.mark.parametrize("outputs", [2, 3])
+@pytest.mark.parametrize("count", [9, 12, 20])
+def test_one_wrong_cell_hides_in_no_noise(count, outputs):
+    told = []
+    for seed in range(20):
+        rng = np.random.default_rng([seed, count, outputs])
+        u, y = _plane(rng, count, outputs)
+        told.append(jaxcal.identify(u, y).verdict.good)
+        row, column = rng.integers(count), rng.integers(outputs)
+        y[row, column] += 10.0
+        with pytest.warns(jaxcal.CalibrationWarning):
+            wrong = jaxcal.identify(u, y)
+        assert row in wrong.outliers or "chance" in str(wrong.verdict), wrong.verdict
+    assert told.count(True) >= 19
+
+
+@pytest.mark.parametrize(
+    ("what", "step"), [("calliper", 0.01), ("display", 0.1), ("steps", 0.25)]
+)
+def test_coarse_digits_are_no_fault(what, step, rng):
+    u = np.repeat(np.arange(0.0, 101.0, 10.0), 2)
+    for _ in range(10):
+        y = u + 0.3 + (what == "calliper") * rng.normal(0.0, 0.004, len(u))
+        y = step * np.round(y / step)
+        assert jaxcal.identify(u[:, None], y[:, None]).verdict.good
+
+
+@pytest.mark.parametrize(
+    "curve",
+    [
+        lambda u: 15.0 * np.tanh(u / 12.0),
+        lambda u: u + 2e-3 * u**3,
+        lambda u: np.clip(u, -12.0, 12.0),
+        lambda u: np.sign(u) * np.maximum(np.abs(u) - 3.0, 0.0),
+    ],
+)
+@pytest.mark.parametrize("inputs", [1, 3])
+def test_a_line_through_an_s_is_not_good(curve, inputs, rng):
+    swept = np.linspace(-20.0, 20.0, 31)[:, None]
+    u = swept if inputs == 1 else rng.uniform(-20.0, 20.0, (40, inputs))
+    noise = rng.normal(0.0, 0.02, u.shape)
+    assert jaxcal.identify(u, u + noise).verdict.good
+    with pytest.warns(jaxcal.CalibrationWarning):
+        assert not jaxcal.identify(u, curve(u) + noise).verdict.good

@@ -110,6 +110,9 @@ def test_every_command_that_writes_keeps_what_it_reads(ask, tmp_path, typed):
         ("identify pairs.csv --overwrite --out d.json", "--overwrite needs --out FILE"),
         ("identify pairs.csv --servos s.json", "--servos needs a recording"),
         ("check c.json pairs.csv --servos s.json", "--servos goes with a recording"),
+        ("check c.json pairs.csv --tolerance 0,5", "must be a number, got '0,5'"),
+        ("check c.json pairs.csv --tolerance m=0,5", "must be UNIT=NUMBER,UNIT=NUM"),
+        ("identify pairs.csv --which a", "--which: cannot read 'a'"),
         ("select t.csv --score 0,1,2 --time-limit 1", "Leave out with --score"),
         ("select t.csv --csv --out plan.json", "--csv and --out plan.json differ"),
         ("select t.csv --json --out plan.csv", "--json and --out plan.csv differ"),
@@ -193,6 +196,104 @@ def test_joints_beside_those_of_the_arm_are_said(ask, tmp_path):
         found = jaxcal.identify(frame[["elbow", "turn"]], read[["y_z", "y_x"]].join(
             read["y_y"]), model=arm)  # fmt: skip
     np.testing.assert_allclose(found.predict(joints[:, :2]), read, atol=1e-6)
+
+
+ARM_UNITS = ["deg,deg,m,m,m", "\u00b0,degrees,[m],[m],[m]"]
+
+
+def of_arm(tmp_path):
+    """(20, 5) joints and positions of an arm whose file is written."""
+    (tmp_path / "arm.urdf").write_text(URDF)
+    arm, rng = SerialChain.from_urdf(tmp_path / "arm.urdf"), np.random.default_rng(1)
+    joints = rng.uniform(-90.0, 90.0, (20, 2))
+    return np.c_[joints, arm.predict(joints) + rng.normal(0.0, 1e-4, (20, 3))]
+
+
+@pytest.mark.parametrize("units", [*ARM_UNITS, "rad,deg,m,m,m", "deg,deg,m,mm,m"])
+def test_a_row_of_units_of_an_arm_is_compared(ask, tmp_path, units):
+    lines = [",".join(map(repr, row)) for row in of_arm(tmp_path).tolist()]
+    (tmp_path / "t.csv").write_text("\n".join(["turn,elbow,y_x,y_y,y_z", *lines]))
+    assert ask("identify t.csv --model arm.urdf --out arm.json")[0] == 0
+    text = "\n".join(["turn,elbow,y_x,y_y,y_z", units, *lines])
+    (tmp_path / "t.csv").write_text(text)
+    typed = "identify t.csv --model arm.urdf", "check arm.json t.csv"
+    for code, _, said in map(ask, typed):
+        if units in ARM_UNITS:
+            assert code == 0 and "units are taken from line 2" in said
+        else:
+            fault = "'turn' is in rad" if "rad" in units else "'y_y' is in mm"
+            assert code == 2 and f"column {fault}, by its row of units" in said
+    (tmp_path / "t.csv").write_text(text.replace(units, "rad,rad,m,m,m"))
+    assert ask("predict arm.json t.csv")[0] == 2
+    assert ask("predict arm.json t.csv --radians")[0] == 0
+
+
+@pytest.mark.parametrize(("unit", "code"), [("rad", 2), ("deg", 0), ("[\u00b0]", 0)])
+def test_a_row_of_units_is_that_of_the_calibration(ask, tmp_path, unit, code):
+    of_both = "--command-unit deg --measured-unit deg"
+    assert ask(f"identify pairs.csv {of_both} --out d.json")[0] == 0
+    rows = csv("", np.hstack([U, Y])).removeprefix("\n")
+    text = f"u_a,u_b,y_a,y_b\n{unit},{unit},{unit},{unit}\n{rows}"
+    (tmp_path / "far.csv").write_text(text)
+    for typed in (
+        "command d.json far.csv",
+        "predict d.json far.csv",
+        "check d.json far.csv",
+        f"identify far.csv {of_both}",
+    ):
+        answer, _, said = ask(typed)
+        assert answer == code
+        assert ("and must be in deg" in said) == (code == 2)
+    assert ask("predict c.json far.csv")[0] == 0  # of no unit
+
+
+def test_what_an_arm_does_not_read_is_said(ask, tmp_path):
+    values = np.c_[of_arm(tmp_path), np.ones(20)]
+    (tmp_path / "t.csv").write_text(csv("turn,elbow,y_x,y_y,y_z", values[:, :5]))
+    code, _, said = ask("identify t.csv --model arm.urdf --out arm.json")
+    assert code == 0 and "column" not in said
+    assert "column" not in ask("check arm.json t.csv")[2]
+    header = "turn,elbow,y_x,y_y,y_z,y_roll,mode"
+    more = (
+        csv(header, values).replace("\n", ",fast\n").replace(f"{header},fast", header)
+    )
+    (tmp_path / "t.csv").write_text(f"{more},fast")
+    for typed in ("identify t.csv --model arm.urdf", "check arm.json t.csv"):
+        said = ask(typed)[2]
+        assert said.count("column 'y_roll' is ignored (not needed)") == 1
+        assert said.count("column 'mode' is read as label: words") == 1
+
+
+@pytest.mark.parametrize("flags", [("0", "1"), ("FALSE", "TRUE"), ("no", "yes")])
+def test_rows_that_are_not_available_are_used_and_said(ask, tmp_path, flags):
+    rows = csv("u_a,u_b,y_a,y_b", np.hstack([U, Y])).splitlines()
+    for zeros in (3, 0):
+        cells = ["available", *(flags[i >= zeros] for i in range(len(U)))]
+        text = "\n".join(f"{r},{c}" for r, c in zip(rows, cells, strict=True))
+        (tmp_path / "far.csv").write_text(text)
+        for typed in ("identify far.csv", "check c.json far.csv"):
+            said = ask(typed)[2]
+            assert ("all rows are used, 3 of them with 0" in said) == (zeros == 3)
+        for typed in ("command c.json far.csv", "predict c.json far.csv"):
+            code, out, said = ask(typed)
+            assert code == 0 and len(out.splitlines()) == 1 + len(U)
+            assert ("all rows are used, 3 of them with 0" in said) == (zeros == 3)
+
+
+@pytest.mark.parametrize(
+    "days", [("Mon", "Tue"), ("2026-05-01", "2026-05-02"), ("1", "2"), ("A", "")]
+)
+def test_sessions_have_any_labels(ask, tmp_path, days):
+    rows = csv("u_a,u_b,y_a,y_b", np.hstack([U, Y])).splitlines()
+    cells = ["day", *(days[i % 2] for i in range(len(U)))]
+    text = "\n".join(f"{c},{r}" for r, c in zip(rows, cells, strict=True))
+    (tmp_path / "far.csv").write_text(text)
+    code, _, said = ask("identify far.csv --session day --out s.json")
+    if "" in days:
+        assert code == 2 and "line 3, column 'day' is empty" in said
+        return
+    assert code == 0
+    assert jaxcal.Calibration.load("s.json").provenance["sessions"]["count"] == 2
 
 
 def test_a_prediction_far_from_the_measurements_is_said(ask, tmp_path):

@@ -5,6 +5,7 @@ import json
 import os
 import pathlib
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -112,6 +113,13 @@ WHOLE = {
     "no header of the bus": replaced("[bus]\n", ""),
     "a value that is too long": replaced("min_deg = -20", "min_deg = " + "9" * 5000),
     "capitals": replaced("[bus]", "[BUS]"),
+    "a map in capitals": lambda text: text.replace("leadshine_pr", "LEADSHINE_PR"),
+    "a host that is called ip": replaced("host =", "ip ="),
+    "units that are called slave_id": lambda text: text.replace("unit =", "slave_id ="),
+    "a space of no width": replaced("host =", "host\u200b ="),
+    "backticks": replaced(HOST, "host = `127.0.0.1`"),
+    "a wide equals sign": replaced("host =", "host \uff1d"),
+    "a space in a number": lambda text: re.sub(r"(port = \d+)(\d{3})", r"\1 \2", text),
     "windows": lambda text: text.replace("\n", "\r\n"),
     "a control character": replaced("[imu]", "[imu]\n# \0 \x07"),
     "git's marks": replaced("[imu]", "<<<<<<< HEAD\n[imu]\n=======\n>>>>>>> other"),
@@ -211,6 +219,33 @@ def test_a_record_that_is_nested_too_deep_is_none(rig, folder):
     _lock_of(rig).armed_path.write_text("[" * 100_000)
     assert main(["stop", "--config", str(rig.path)]) == 0
     assert stopped(rig) == ALL
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "stop", "stop rig.toml", "stop --output runs", "stop --axis pitch", "stop all",
+        "stop pitch", "stop \u2013config rig.toml", "stop --config RIG.TOML", "STOP",
+        "Stop", "-v stop", "--config rig.toml stop", "stop pitch rig.toml", "--stop",
+        "stop --config=gone/rig.toml", "stop notes.txt",
+    ],
+)  # fmt: skip
+def test_words_that_name_no_file_do_not_keep_it(words, rig, monkeypatch, capsys):
+    monkeypatch.chdir(rig.path.parent)
+    rig.path.with_name("notes.txt").write_text("to do")
+    assert main(words.split()) == 0
+    assert stopped(rig) == ALL
+    said = capsys.readouterr().out
+    for word in ("runs", "gone", "notes.txt"):
+        assert (word in words) <= (word in said)
+
+
+@pytest.mark.parametrize("words", ["goto stop", "stpo", "halt", "stop --help"])
+def test_another_command_stops_nothing(words, rig, monkeypatch):
+    monkeypatch.chdir(rig.path.parent)
+    with contextlib.suppress(SystemExit):
+        main(words.split())
+    assert not stopped(rig)
 
 
 def test_the_folder_of_the_file_is_taken_for_it(rig):

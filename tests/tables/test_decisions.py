@@ -69,6 +69,57 @@ def test_what_could_be_meant_otherwise_is_said(name, column, words):
         assert table.commands(None) == (name, "a", "b")
 
 
+GAPS = np.delete(np.arange(1.0, 14.0), 6)  # of a test that was left out
+
+
+@pytest.mark.parametrize("name", ["Zeit [s]", "temps (s)", "X_Value", "Versuch Nr."])
+@pytest.mark.parametrize(
+    "column", [SORTED, GAPS, RNG.permutation(GAPS), SHUFFLED + 100.0]
+)
+def test_what_may_be_a_time_or_a_row_number_is_said(name, column):
+    if name == "Versuch Nr." and column is SORTED:
+        name = "ms"
+    table = roles(f"{name},a,b", {name: column})[0]
+    with pytest.warns(UserWarning) as said:
+        assert table.commands(None) == (name, "a", "b")
+    assert f"column '{name}' is read as input: may be a time" in str(said[0].message)
+    assert "--inputs" in str(said[0].message)
+
+
+LEVELS = np.array([(i, j) for i in range(4) for j in range(3)]) * 10.0
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"a": LEVELS[:, 0], "b": LEVELS[:, 1]},
+        {"a": SORTED, "b": SORTED**2},  # swept together
+        {"a": SORTED - 4.0},  # sorted commands of both signs
+        {"a": RNG.permutation(12) * 15.0},
+        {"a": RNG.integers(0, 181, 12)},
+        {"a": np.arange(12) // 3},
+        {},
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_levels_and_sweeps_are_read_without_a_word(columns):
+    assert roles("a,b", columns)[0].commands(None) == ("a", "b")
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_sweep_beside_its_reading_is_read_without_a_word():
+    table = roles("angle,y_1", {"angle": SORTED})[0]
+    assert table.commands(None, but=["y_1"]) == ("angle",)
+
+
+@pytest.mark.parametrize("form", ["u[{}] y[{}]", "u({}) y({})", "U_{} Y_{}"])
+def test_readings_that_no_prefix_marks_are_said(form):
+    u, y = form.split()
+    names = [u.format(0), u.format(1), y.format(0)]
+    with pytest.warns(UserWarning, match="is read as input: readings begin with y_"):
+        assert roles(",".join(names))[0].commands(None) == (*names,)
+
+
 def test_a_design_of_two_levels_is_read_without_a_word():
     levels = np.array([[i >> k & 1 for k in range(3)] for i in range(8)], float)
     names = parse(
@@ -140,6 +191,12 @@ def test_columns_that_nothing_asks_for_are_said():
     table = roles("j1,j2,j3,j4,x", {"j4": np.arange(12.0)})[0]
     with pytest.warns(UserWarning, match="columns 'j3', 'j4' are ignored"):
         table.named(["j1", "j2"], "u_", others=["x"])
+
+
+def test_words_that_nothing_asks_for_are_said():
+    table = parse("t.csv", b"j1,mode,note\n1,fast,a\n5,slow,b\n")
+    with pytest.warns(UserWarning, match="'mode', 'note' are read as label: words"):
+        table.named(["j1"], "u_", others=[])
 
 
 def test_several_columns_are_told_in_the_plural():

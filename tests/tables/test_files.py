@@ -38,6 +38,10 @@ def of_excel(*, sep: bool = False) -> str:
     return ("sep=;\r\n" if sep else "") + text_of(";", ",", end="\r\n")
 
 
+def with_sep(delimiter: str, line: str) -> str:
+    return f"{line}\n" + text_of(delimiter)
+
+
 PLAIN = text_of()
 LINES = PLAIN.splitlines()
 DIALECTS = {
@@ -45,6 +49,8 @@ DIALECTS = {
     "quoted": "\n".join('"' + '","'.join(line.split(",")) + '"' for line in LINES),
     "Excel in German": of_excel(),
     "Excel with sep=": of_excel(sep=True),
+    "sep= of tabs": with_sep("\t", "sep=\t"),
+    "SEP= in quotes": with_sep("|", '"SEP=|"'),
     "tabs and decimal commas": text_of("\t", ","),
     "blanks": text_of(" "),
     "aligned": text_of("    ", form="12.4f"),
@@ -260,6 +266,35 @@ def test_units_need_not_all_be_known(units):
     text = "\n".join(["u_a,u_b,y_c", units, "1,2,3", "3,4,5", "5,9,1"])
     with pytest.warns(UserWarning, match="units are taken from line 2"):
         assert len(parse("t.csv", text.encode())) == 3
+
+
+@pytest.mark.parametrize(
+    ("stated", "wanted", "same"),
+    [
+        ("rad", "deg", False),
+        ("mm", "m", False),
+        ("ms", "s", False),
+        ("mV", "MV", False),
+        ("V", "", True),
+        ("", "deg", True),
+        ("-", "deg", True),
+        ("[\u00b0]", "deg", True),
+        ("degrees", "deg", True),
+        ("rad", "radians", True),
+        ("\u00b5m", "um", True),
+        ("m/s\u00b2", "m/s^2", True),
+    ],
+)
+def test_a_row_of_units_is_compared(stated, wanted, same):
+    text = f"u_a,y_c\nmm,{stated}\n1,2\n3,4\n5,9\n"
+    with pytest.warns(UserWarning, match="units are taken"):
+        table = parse("t.csv", text.encode())
+    table.require_units(["u_a"], ["mm"])
+    if same:
+        return table.require_units(["y_c", "u_a"], [wanted, ""])
+    fault = f"column 'y_c' is in {stated}, by its row of units, and must be in {wanted}"
+    with pytest.raises(ValueError, match=fault):
+        table.require_units(["u_a", "y_c"], ["mm", wanted])
 
 
 def test_words_below_the_header_are_no_units():

@@ -152,6 +152,85 @@ def test_a_fault_names_row_and_column(changes, message):
         jaxcal.identify(frame, READINGS)
 
 
+FREE = np.arange(12) != 4
+MASKS = {
+    "dict": lambda c, m: {x: np.ma.masked_array(y, m & (x == "yaw")) for x, y in c},
+    "whole numbers": lambda c, m: {
+        x: np.ma.masked_array(y.astype(int), m & (x == "yaw")) for x, y in c
+    },
+    "words": lambda c, m: {
+        x: np.ma.masked_array([*map(str, y)], m & (x == "yaw")) for x, y in c
+    },
+    "structured": lambda c, m: np.ma.array(
+        [*zip(*(y for _, y in c), strict=True)],
+        dtype=[(x, float) for x, _ in c],
+        mask=[tuple(bad and x == "yaw" for x, _ in c) for bad in m],
+    ),
+}
+MASKS["rows"] = lambda c, m: [*MASKS["structured"](c, m)]
+
+
+@pytest.mark.parametrize("maker", MASKS)
+def test_a_masked_number_is_missing(maker):
+    columns = [(name, COMMANDS[name].to_numpy()) for name in AXES]
+    healthy = MASKS[maker](columns, np.zeros(12, bool))
+    masked = MASKS[maker](columns, ~FREE)
+    jaxcal.identify(healthy, READINGS)
+    for question in (jaxcal.identify, lambda frame, _: jaxcal.select(frame, 4)):
+        with pytest.raises(ValueError, match=r"row 4, column 'yaw' must hold a number"):
+            question(masked, READINGS)
+    wanted = jaxcal.select(healthy, 4, available=FREE).indices
+    found = jaxcal.select(masked, 4, available=FREE).indices
+    np.testing.assert_array_equal(found, wanted)
+
+
+def test_a_masked_target_is_missing(calibration):
+    row = dict(TARGETS.iloc[0])
+    calibration.command_for(row)
+    for given in (row, [row, row]):
+        row["y_yaw"] = np.ma.masked
+        with pytest.raises(ValueError, match="row 0, column 'y_yaw' must hold a num"):
+            calibration.command_for(given)
+
+
+@pytest.mark.parametrize(
+    ("available", "message"),
+    [
+        (["yes", "no"] * 6, "available must hold True or 1 .* got yes"),
+        ([True] * 5, r"available must have shape \(12,\), got \(5,\)"),
+        ([[1] * 12], r"available must have shape \(12,\), got \(1, 12\)"),
+    ],
+)
+def test_what_is_no_mask_is_refused(available, message):
+    with pytest.raises(ValueError, match=message):
+        jaxcal.select(COMMANDS, 4, available=available)
+    gap = COMMANDS.assign(yaw=np.where(FREE, U[:, 1], np.nan))
+    for mask in (FREE, FREE.astype(int), FREE.astype(float), FREE.tolist()):
+        assert 4 not in jaxcal.select(gap, 4, available=mask).indices
+
+
+def test_a_constant_column_is_named():
+    with pytest.raises(ValueError, match=r"the same in every row: load$"):
+        jaxcal.select(COMMANDS.assign(load=3.0), 5)
+
+
+def test_rows_that_are_not_available_are_used_and_said(calibration):
+    flags = {"available": [0, 1, 1] * 4}
+    both = COMMANDS.join(READINGS).rename(columns=lambda x: x if "_" in x else f"u_{x}")
+    for question in (
+        jaxcal.identify,
+        calibration.predict,
+        calibration.command_for,
+        calibration.check,
+    ):
+        with pytest.warns(UserWarning, match="rows are used, 4 of them with 0"):
+            question(both.assign(**flags))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            question(both.assign(available=True))
+        assert not [x for x in said if x.category is UserWarning]
+
+
 def test_single_precision_stays_what_it_is():
     frame = COMMANDS.astype(np.float32)
     plain = jaxcal.Design(frame.to_numpy()).candidate_set.candidates

@@ -27,6 +27,7 @@ BEFORE = 2.0  # times its noise, a calibration explains readings
 OUTLIER = np.log(20.0)  # of one row in twenty
 _FLOOR = 1e-7  # of the spread of the readings: below it is rounding
 _MOST_OUT = 0.35, 0.2  # share of rows that may be outliers: as it is, paired anew
+_WAVES = 6  # half periods of a drift
 _FREEDOM = 4.0  # of Student's t, of the robust start
 _ROUNDS = 6  # of robust weights, and of linearising
 _RIDGE = 1e-11  # of a column's square: what no row excites stays at the prior's mean
@@ -403,7 +404,10 @@ def benign_fits(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
     i, j = np.triu_indices(n)
     squares = commands[:, i] * commands[:, j]
     cubes = np.hstack([squares[:, i == j], commands**3])
-    for more in (squares, cubes, np.hstack([cubes, time])):
+    terms = [squares, cubes, np.hstack([cubes, time])]
+    if best.hypothesis.kind in SESSIONS:  # a drift that turns
+        terms.append(np.cos(0.5 * np.pi * (time + 1.0) * np.arange(1, _WAVES)))
+    for more in terms:
         if more.shape[1] + n + 1 < count // 2:
             extras.append(more)
     if best.hypothesis.kind in SESSIONS:

@@ -30,7 +30,7 @@ from jaxcal.calibration.pairing.fit import (
     path_match,
     top,
 )
-from jaxcal.calibration.reasons import froze, in_rows
+from jaxcal.calibration.reasons import COARSE, froze, in_rows, resolution
 from jaxcal.checks import Array, in_words
 from jaxcal.models.model import Model, Rows
 from jaxcal.models.uncertainty import Prior
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 _SURE = 8.0  # log of the odds at which a mispairing is said
 RATIO = 2.0  # times the noise without it, least squares of the table as it stands
 _SURE_BESIDE, _BENIGN = 6.0, 1.4  # both, beside what machines do
+_FAR = 20.0  # log of the odds from which the noise beside that does not count
 _AS_GOOD = 3.0  # log of the odds within which another kind is named too
 _TRIED = 6  # hypotheses that are fitted one by one
 _WORTH = 12.0  # log of the odds: of those that are so much worse at first, none
@@ -51,6 +52,7 @@ _USUAL = 2.0  # times the usual noise of a sensor
 _OFF, _APART_BY, _FEW = 5.0, 1.5, 0.3
 _TREND, _TREND_OF_MANY = 1.4, 2.0  # of a sum of residuals, over their squares' root
 LEAST, _MANY = 6, 500  # rows
+_MOVED, _ROWS_ALONE = 4, 2000  # rows of one output alone: least, and the first
 _NAMED = 2  # other explanations
 _READINGS = 1.5  # for each parameter; of fewer another machine explains as much
 _CHANCE = 0.02  # that so many outliers stand so near one another
@@ -71,18 +73,25 @@ class Mispairing:
     change: ColumnChange | None = None
     sensed: Any = None  # slice of columns of commands that come with the reading
     alternatives: tuple[str, ...] = ()  # what would explain the readings as well
+    output: str = ""  # whose readings alone are mispaired
 
     @property
     def mendable(self) -> bool:
         """Whether ``repaired`` puts the table right."""
-        return self.kind not in SESSIONS
+        return self.kind not in SESSIONS and not self.output
 
     def repaired(self, commands: Array, measured: Array) -> tuple[Array, Array]:
         """The rows of the table that belong together, (K, n) and (K, q); a ValueError
         where rows of two sessions cannot be made one."""
+        if self.output:
+            raise ValueError(f"one column cannot be repaired: {self.reason}")
         if not self.mendable:
             raise ValueError(
                 "a table of two sessions cannot be repaired: identify each alone"
+            )
+        if self.alternatives:
+            raise ValueError(
+                f"the table is not repaired, for it is not known how: {self.reason}"
             )
         if self.change is not None and self.change.estimated:
             raise ValueError(
@@ -187,6 +196,13 @@ def of_fit(fit: Fit) -> Table | None:
     """The table of a fit, linearised there."""
     prior = stated_prior(fit) or fit.model.default_prior()
     measured = fit.residuals + outputs_at(fit, fit.commands)
+    if fit.noise_std is not None:  # what a display rounded, it read within a step
+        step = resolution(measured, COARSE)
+        step[fit.noise_std >= step] = 0.0
+        if step.any():
+            measured += step * np.random.default_rng(0).uniform(
+                -0.5, 0.5, measured.shape
+            )
     counted = fit.loss_weights > 0.0
     table = _table(fit.model, fit.commands, measured, prior, counted)
     return table and dataclasses.replace(table, theta=np.asarray(fit.parameters))
@@ -239,9 +255,36 @@ def _table(
 def _found(
     table: Table | None, inputs: Names, outputs: Names, unit: str
 ) -> Mispairing | None:
-    """The mispairing of a table."""
+    """The mispairing of a table, or of one of its outputs."""
     if table is None:
         return None
+    pairing = _of_all(table, inputs, outputs, unit)
+    if pairing is not None or not table.shared or len(outputs) == 1:
+        return pairing
+    rows = len(table.mean) // len(outputs)
+    none = np.zeros(rows)
+    for j, name in enumerate(outputs):
+        alone = dataclasses.replace(
+            table, commands=table.commands[:_ROWS_ALONE],
+            measured=table.measured[:_ROWS_ALONE, [j]],
+            counted=table.counted[:_ROWS_ALONE], mean=none, precision=none,
+            free=np.ones(rows, np.bool_), theta=none, scale=table.scale[[j]],
+            width=table.width[[j]],
+        )  # fmt: skip
+        pairing = _of_all(alone, inputs, (name,), unit)
+        if pairing is None:
+            continue
+        moved = (pairing.match >= 0) & (pairing.match != np.arange(len(pairing.match)))
+        if moved.sum() >= _MOVED:
+            reason = f"{name} alone: {pairing.reason}"
+            return dataclasses.replace(pairing, reason=reason, output=name)
+    return None
+
+
+def _of_all(
+    table: Table, inputs: Names, outputs: Names, unit: str
+) -> Mispairing | None:
+    """The mispairing of all outputs together."""
     plain = fitted(table, as_it_is(table))
     if (plain.rms <= _EXACT * table.width).all():
         return None
@@ -268,10 +311,12 @@ def _found(
         return None
     if best.hypothesis.kind != _APART:
         for benign in benign_fits(table, plain, best):
-            if best.evidence - benign.evidence < _SURE_BESIDE:
-                return None
+            ahead = best.evidence - benign.evidence
             by_itself = benign is not plain and not benign.hypothesis.code
-            if by_itself and not better(benign, best, _BENIGN):
+            close = ahead < _FAR or best.hypothesis.kind in SESSIONS
+            if ahead < _SURE_BESIDE:
+                return None
+            if by_itself and close and not better(benign, best, _BENIGN):
                 return None
     near: dict[int, list[int]] = {}
     if best.hypothesis.kind == "path":
@@ -293,6 +338,7 @@ def _found(
     match = best.hypothesis.match
     if best.hypothesis.kind == _APART:
         match = path_match(len(match), best.hypothesis.starts)
+    match = _certain(table, best, match, near)
     return Mispairing(
         best.hypothesis.kind,
         "; or ".join([reason, *others]),
@@ -302,6 +348,26 @@ def _found(
         table.model.fitting.sensed,
         tuple(others),
     )
+
+
+def _certain(
+    table: Table, fit: Fitted, match: Rows, near: dict[int, list[int]]
+) -> Rows:
+    """(N,) match without readings whose command may be another: where a shift may begin
+    at several rows, outliers beside that, which may be shifted by more, and those of a
+    command that has several, but for copies."""
+    match = match.copy()
+    if near:
+        match[~fit.inside] = -1
+    for rows in near.values():
+        match[rows[0] : rows[-1]] = -1
+    for row in np.flatnonzero(np.bincount(match[match >= 0]) > 1):
+        readings = np.flatnonzero(match == row)
+        inside = readings[fit.inside[readings]]
+        same = len(inside) and (table.measured[inside] == table.measured[inside[0]])
+        match[readings] = -1
+        match[inside[: int(np.all(same))]] = row
+    return match
 
 
 def _as_good(table: Table, best: Fitted, fits: list[Fitted]) -> list[Fitted]:

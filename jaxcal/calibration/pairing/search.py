@@ -243,6 +243,7 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     """Rows of two sessions: from one on another offset, or other parameters too."""
     table, count = systems.table, len(systems.table.commands)
     scored: list[tuple[float, Hypothesis]] = []
+    path: Path
     after = np.arange(count)
     code = _KINDS + np.log(count)
     slopes, right, _ = systems.of(after[None])
@@ -272,6 +273,14 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
         path = ((0, 0), (int(edges[at]), 0))
         hypothesis = Hypothesis(kind, after, code, path, extra=more[at])
         scored.append((float(scores[at]) - code, hypothesis))
+        if kind == "offset" and table.shared:  # a third session
+            both = np.concatenate([more, np.broadcast_to(more[at], more.shape)], -1)
+            scores = _with_columns(systems, slopes, right, both)
+            scores[np.abs(edges - edges[at]) < _LEAST] = -np.inf
+            other = int(scores.argmax())
+            path = ((0, 0), *((int(edges[i]), 0) for i in sorted((at, other))))
+            hypothesis = Hypothesis(kind, after, 2.0 * code, path, extra=both[other])
+            scored.append((float(scores[other]) - 2.0 * code, hypothesis))
     return scored
 
 
@@ -332,6 +341,11 @@ def what_is_wrong(
     if kind == "exchanged":
         rows = np.flatnonzero(hypothesis.match != np.arange(count))
         return f"the readings of rows {', '.join(map(str, rows))} are exchanged"
+    if kind == "offset" and len(starts) > 2:
+        return (
+            f"the table seems to join three sessions: from row {starts[1][0]} on and "
+            f"from row {starts[2][0]} on the readings have another offset"
+        )
     if kind in ("offset", "parameters"):
         another = "slope or offset"
         if kind == "offset":

@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxcal.calibration.fit import linearised
-from jaxcal.calibration.pairing.fit import as_it_is, benign_fits, fitted, predicted
+from jaxcal.calibration.pairing.fit import (
+    SESSIONS,
+    as_it_is,
+    benign_fits,
+    fitted,
+    predicted,
+)
 from jaxcal.calibration.pairing.judge import LEAST, RATIO, Mispairing, better, of_fit
-from jaxcal.calibration.reasons import Reason, in_rows
+from jaxcal.calibration.reasons import COARSE, Reason, in_rows, resolution
 from jaxcal.calibration.verdict import Verdict, bends
 from jaxcal.checks import in_words
 
@@ -41,7 +47,7 @@ def against(verdict: Verdict, fit: Fit, pairing: Mispairing | None) -> Verdict:
         )
     what = "columns" if pairing.kind == "columns" else "table"
     step = f"correct the {what}, then identify again"
-    if not pairing.mendable:
+    if pairing.kind in SESSIONS:
         step = "identify each session by itself"
         if pairing.kind == "offset":
             step = f"take the offset off the readings of one session, or {step}"
@@ -73,7 +79,8 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     if fit.noise_known and (plain.noise * table.scale > RATIO * stated).any():
         return None  # what was stated is too small for the others too
     readings = (table.measured / table.scale)[rows]
-    away = np.abs(readings - predicted(table, plain)[rows]) / plain.noise
+    noise = np.hypot(plain.noise, resolution(fit.measured, COARSE) / table.scale)
+    away = np.abs(readings - predicted(table, plain)[rows]) / noise
     away, benign = away.max(axis=1), benign_fits(table, plain, plain)
     rows = rows[away >= _OFF]
     if not len(rows) or max(x.evidence for x in benign) > plain.evidence:
@@ -81,10 +88,10 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     least = float(away[away >= _OFF].min())
     named = in_rows([*map(int, rows)])
     verb = "are outliers" if len(rows) > 1 else "is an outlier"
-    noise = f"{in_words(plain.noise * table.scale)} {fit.measured_unit}".strip()
+    others = f"{in_words(noise * table.scale)} {fit.measured_unit}".strip()
     return Reason(
         f"{named.capitalize()} {verb}, over {least:.2g} times the noise of the "
-        f"others, which is {noise} without them.",
+        f"others, which is {others} without them.",
         f"repeat {named} (counted from 0), or leave out",
     )
 

@@ -197,7 +197,8 @@ def _checked_problem(
         white = whiten(raw[None], available[None], root, computed=computed)[0]
     if white is None:
         if not names and candidates is not None:
-            names = (*axis_names("names", None, "u", candidates.shape[1]), "the bias")
+            axes = axis_names("names", offer.axes, "u", candidates.shape[1])
+            names = (*axes, "the bias")
             if not len(root):
                 about = "candidates", "available ones"
                 require_excited(candidates[available], names[:-1], *about)
