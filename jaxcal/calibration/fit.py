@@ -191,7 +191,7 @@ class Fit:
         most = special.chdtri(self.num_readings, 0.01 / self.num_measurements)
         times, limit = studentised(self)
         far = (self.distance > most) | (times > limit)
-        if far.any() and not self.noise_known:
+        if far.any() and self.noise_dof:
             step = resolution(self.measured, COARSE)
             far &= (np.abs(deleted(self)) > 2.0 * step).any(axis=1)
         (rows,) = far.nonzero()
@@ -317,8 +317,8 @@ def linearised(fit: Fit, rows: Array, *, misfit: bool = True) -> tuple[Array, Ar
 
 def deleted(fit: Fit) -> Array:
     """(N, m) residuals from the fit without each measurement, by its mean leverage."""
-    white = (fit.residuals / fit.noise_std) ** 2
-    square = white.sum(axis=1)
+    noise = np.asarray(fit.noise_std)
+    square = ((fit.residuals / np.where(noise > 0.0, noise, 1.0)) ** 2).sum(axis=1)
     grown = fit.distance / np.where(square > 0.0, square, np.inf)
     return np.asarray(fit.residuals * grown[:, None])
 

@@ -373,7 +373,7 @@ def _smooth(fit: Fit) -> tuple[int, int] | None:
     used = fit.loss_weights > 0.0
     count, residuals = int(used.sum()), fit.residuals[used]
     # What a display rounded, or a computer, follows a pattern of its own.
-    residuals = residuals * (fit.noise_std > resolution(fit.measured))
+    residuals = residuals * (np.asarray(fit.noise_std) > resolution(fit.measured))
     least, along = 0.5, None
     for k in range(fit.num_inputs):
         order = np.argsort(fit.commands[used, k], kind="stable")

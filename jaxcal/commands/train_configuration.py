@@ -327,10 +327,10 @@ def _prolonged(
             + ", ".join(sorted(map(flag_of, unread)))
         )
     for name, value in flags.items():
-        if value <= (held := getattr(config.ppo, name)):
+        if value < (held := getattr(config.ppo, name)):
             raise ValueError(
-                f"{flag_of(name)} must be above {held}, what the run already has, got "
-                f"{value}"
+                f"{flag_of(name)} must be at least {held}, what the run already has, "
+                f"got {value}"
             )
     imitated = getattr(config, "num_imitated", 0)
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **flags))

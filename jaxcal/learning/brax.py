@@ -23,6 +23,7 @@ from brax.training.agents.ppo import train as brax_train
 from brax.training.agents.ppo.networks import PPONetworks
 from brax.training.networks import FeedForwardNetwork
 
+from jaxcal.learning.core.network import log_softmax
 from jaxcal.learning.environments.functional import FunctionalEnv, PosturesEnv, renewed
 
 
@@ -106,7 +107,7 @@ def wrap_fresh(
 
 class _MaskedCategorical(distribution.ParametricDistribution):
     def create_dist(self, parameters: jax.Array) -> Any:
-        log_probs = jax.nn.log_softmax(parameters)
+        log_probs = log_softmax(parameters)
         entropy = -(jnp.exp(log_probs) * log_probs).sum(-1)
 
         def log_prob(x: jax.Array) -> jax.Array:

@@ -7,6 +7,7 @@ be chosen next, of one environment ``action_masks()`` too, as sb3-contrib asks f
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -26,6 +27,12 @@ Array = NDArray[Any]
 
 def _spaces(env: FunctionalEnv) -> tuple[spaces.Discrete, spaces.Box]:
     return spaces.Discrete(env.num_actions), spaces.Box(*env.observation_range)
+
+
+def _begun(state: Any) -> Any:
+    if state is None:
+        raise gymnasium.error.ResetNeeded("call reset before the first step")
+    return state
 
 
 class JaxSingle(gymnasium.Env):
@@ -58,14 +65,14 @@ class JaxSingle(gymnasium.Env):
                 f"{action!r}"
             )
         self._state, observation, self._mask, *rest = self._advance(
-            self._state, int(action)
+            _begun(self._state), int(action)
         )
         reward, done, metric = (leaf.item() for leaf in rest)
         info = {"action_mask": self.action_masks(), self._metric: metric}
         return np.array(observation), reward, done, False, info
 
     def action_masks(self) -> Array:
-        return np.array(self._mask)
+        return np.array(_begun(self._mask))
 
 
 class JaxVector(VectorEnv):
@@ -96,12 +103,25 @@ class JaxVector(VectorEnv):
         self._ended = np.zeros(num_envs, bool)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Array, dict[str, Any]]:
-        if seed is not None:
-            self._key = jax.random.key(seed)
-        self._key, key = jax.random.split(self._key)
-        keys = jax.random.split(key, self.num_envs)
+        """``seed`` of all environments, or one of each."""
+        if isinstance(seed, Iterable):
+            if len(seed) != self.num_envs:
+                raise ValueError(
+                    f"seed must be one number, or {self.num_envs}, one per "
+                    f"environment, got {seed}"
+                )
+            pairs = [jax.random.split(jax.random.key(number)) for number in seed]
+            self._key, keys = pairs[0][0], jnp.stack([pair[1] for pair in pairs])
+        else:
+            if seed is not None:
+                self._key = jax.random.key(seed)
+            self._key, key = jax.random.split(self._key)
+            keys = jax.random.split(key, self.num_envs)
         self._state, (obs, mask) = self._reset(keys)
         self._ended = np.zeros(self.num_envs, bool)
         return np.asarray(obs), {"action_mask": np.asarray(mask)}
@@ -112,7 +132,15 @@ class JaxVector(VectorEnv):
                 f"actions must hold one per environment, ({self.num_envs},), got shape "
                 f"{np.shape(actions)}"
             )
-        self._state, *seen = self._step(self._state, self._ended, jnp.asarray(actions))
+        choices = np.arange(self.single_action_space.n)
+        for i in np.flatnonzero(~np.isin(actions, choices))[:1]:
+            raise ValueError(
+                f"actions must be whole numbers in [0, {len(choices)}), got "
+                f"{actions[i]} in environment {i}"
+            )
+        self._state, *seen = self._step(
+            _begun(self._state), self._ended, jnp.asarray(actions, jnp.int32)
+        )
         (obs, mask), (last, last_mask), reward, done, metric = jax.tree.map(
             np.asarray, seen
         )
@@ -145,23 +173,30 @@ class JaxVector(VectorEnv):
         return *self._shown(state), last, reward, done, metric
 
 
-def _postures(sizes: dict[str, Any]) -> PosturesEnv:
+def _postures(sizes: dict[str, Any], render_mode: str | None) -> PosturesEnv:
+    if render_mode not in (None, "rgb_array"):  # which Stable-Baselines3 always asks
+        raise ValueError(
+            f"render_mode must be None, there is nothing to see, got {render_mode!r}"
+        )
     fields = [field.name for field in dataclasses.fields(SelectionConfig)]
     for name in [name for name in sizes if name not in fields]:
         raise ValueError(f"options must be of {', '.join(fields)}, got {name}")
     return PosturesEnv(SelectionConfig(**sizes))
 
 
-def posture(**sizes: Any) -> JaxSingle:
-    return JaxSingle(_postures(sizes))
+def posture(render_mode: str | None = None, **sizes: Any) -> JaxSingle:
+    return JaxSingle(_postures(sizes, render_mode))
 
 
 def postures(
-    num_envs: int = 1, autoreset_mode: str | AutoresetMode = "SameStep", **sizes: Any
+    num_envs: int = 1,
+    autoreset_mode: str | AutoresetMode = "SameStep",
+    render_mode: str | None = None,
+    **sizes: Any,
 ) -> JaxVector:
     """The environment ``jaxcal/Postures-v0`` of many, see ``JaxVector``; ``sizes`` are
     fields of ``SelectionConfig``."""
-    return JaxVector(_postures(sizes), num_envs, autoreset_mode)
+    return JaxVector(_postures(sizes, render_mode), num_envs, autoreset_mode)
 
 
 gymnasium.register(

@@ -50,6 +50,39 @@ def test_reset_after_done_draws_new_candidates_and_nothing_is_truncated():
     assert len(seen) == 6
 
 
+@pytest.mark.parametrize("least", [-1e9, -np.inf])
+def test_the_distribution_of_masked_logits_is_that_of_the_others(least):
+    from brax.training.distribution import IdentityPostprocessor
+
+    free, action = jnp.array([0.3, -1.0, 0.8]), jnp.int32(2)
+    kind = brax_env._MaskedCategorical(4, IdentityPostprocessor(), 0, False)
+    made = kind.create_dist(jnp.append(free, least))
+    shares = np.exp(free) / np.exp(free).sum()
+    assert made.entropy() == pytest.approx(-(shares * np.log(shares)).sum(), rel=1e-6)
+    assert made.log_prob(action) == pytest.approx(np.log(shares[2]), rel=1e-6)
+
+
+def test_braxs_trainer_has_its_folder_alone(tmp_path, monkeypatch):
+    from jaxcal.learning.training import brax_ppo
+    from jaxcal.learning.training.run import locked
+
+    config = brax_ppo.adapted(presets.load("compact"))
+    shapes = jax.eval_shape(config.learners[0].init, jax.random.key(0))
+    params = jax.tree.map(lambda leaf: np.ones(leaf.shape, leaf.dtype), shapes)
+
+    def second(*_, **__):  # begun while the first trains
+        with pytest.raises(BlockingIOError, match="another training is writing to"):
+            with locked(tmp_path):
+                pass
+        return None, (None, {"params": {"network": params}}), None
+
+    monkeypatch.setattr(brax_env, "train", second)
+    with locked(tmp_path), pytest.raises(BlockingIOError):
+        brax_ppo.train(config, tmp_path, print)
+    brax_ppo.train(config, tmp_path, print)
+    assert checkpoint.load(tmp_path).meta["trainer"] == "brax"
+
+
 @pytest.mark.slow
 @pytest.mark.trains
 def test_a_script_of_a_brax_user_trains_postures_and_a_task():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from jaxcal.adaptive.environment import TaskEnv
 from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
 from jaxcal.learning import PosturesEnv
+from jaxcal.learning.environments.functional import renewed
 from jaxcal.learning.environments.selection import SelectionConfig
 
 
@@ -52,6 +55,34 @@ def test_postures_pay_the_log_det_of_what_is_chosen_and_begin_anew():
             assert last["log_det"][episode] == pytest.approx(10 * paid, abs=1e-2)
             assert last["action_mask"][episode].all()  # of the episode that begins
     assert not np.array_equal(kept[0][0], kept[4][0])
+
+
+@pytest.mark.parametrize("maps", [0, 1, 2, 3])
+def test_nothing_begins_while_none_is_done_under_any_number_of_maps(maps):
+    begun = []
+
+    def begin(key):
+        jax.debug.callback(begun.append, jnp.zeros(()))
+        return {"a": jax.random.uniform(key), "b": jax.random.uniform(key, (2, 3))}
+
+    shape = (2, 3, 4)[:maps]
+    keys = jax.random.split(jax.random.key(0), shape)
+    after = {"a": jnp.full(shape, 7.0), "b": jnp.full((*shape, 2, 3), 8.0)}
+    step = functools.partial(renewed, begin)
+    fresh = begin
+    for _ in shape:
+        step, fresh = jax.vmap(step), jax.vmap(fresh)
+    fresh = fresh(keys)
+    for done in (np.zeros(shape, bool), np.arange(np.prod(shape)).reshape(shape) == 0):
+        begun.clear()
+        out = jax.block_until_ready(jax.jit(step)(done, keys, after))
+        jax.effects_barrier()
+        assert bool(begun) == done.any()
+        for name, leaf in out.items():
+            over = np.expand_dims(done, tuple(range(maps, leaf.ndim)))
+            np.testing.assert_array_equal(
+                leaf, np.where(over, fresh[name], after[name])
+            )
 
 
 def test_a_rule_without_a_price_is_refused():

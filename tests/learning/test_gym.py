@@ -51,6 +51,65 @@ def test_a_bad_option_and_a_bad_step_are_one_line():
             envs.step(actions)
 
 
+NAME = "jaxcal/Postures-v0"
+
+
+@pytest.mark.parametrize("asked", [{}, {"render_mode": None}])
+@pytest.mark.parametrize("mode", ["vector_entry_point", "sync"])
+def test_a_render_mode_of_none_is_taken(asked, mode):
+    for env in (
+        gymnasium.make(NAME, **asked),
+        gymnasium.make(NAME, render_mode="rgb_array"),  # as Stable-Baselines3 does
+        gymnasium.make_vec(NAME, num_envs=2, vectorization_mode=mode, **asked),
+    ):
+        assert env.reset(seed=1)[0].shape[-1] == 210
+        assert env.unwrapped.render_mode is None
+    with pytest.raises(ValueError, match=r"^render_mode must be None.* got 'human'$"):
+        gymnasium.make(NAME, render_mode="human")
+
+
+def test_each_environment_may_have_a_seed_of_its_own():
+    envs = gymnasium.make_vec(NAME, num_envs=3, num_candidates=8)
+
+    def begun(seed):
+        return envs.reset(seed=seed)[0][:, :24]
+
+    first, again, other = map(begun, ([1, 2, 3], np.array([1, 2, 3]), (3, 2, 9)))
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first[1], other[1])  # the seeds that are the same
+    assert len({row.tobytes() for row in [*first, *other]}) == 4
+    after = [(begun(seed), begun(None))[1] for seed in ([1, 2, 3], [1, 2, 3], 4)]
+    np.testing.assert_array_equal(after[0], after[1])
+    assert not np.array_equal(after[0], first) and not np.array_equal(*after[1:])
+    for seed in ([1, 2], [[1, 2, 3]]):
+        with pytest.raises(ValueError, match=r"^seed must be one number, or 3, one"):
+            envs.reset(seed=seed)
+
+
+@pytest.mark.parametrize("value", [8, -1, 50, 2.5, np.nan, None])
+def test_an_action_out_of_range_is_refused_in_a_batch_too(value):
+    envs = gymnasium.make_vec(NAME, num_envs=3, num_candidates=8)
+    envs.reset(seed=0)
+    actions = np.array([0, 7, 2 if value is None else value])
+    if value is None:
+        assert envs.step(actions)[1].shape == envs.step([1, 2, 3])[1].shape == (3,)
+        return
+    with pytest.raises(
+        ValueError, match=rf"^actions must be .*\[0, 8\), got {value} .* 2$"
+    ):
+        envs.step(actions)
+
+
+def test_a_step_before_the_first_reset_is_one_line():
+    single = gymnasium.make(NAME).unwrapped
+    vector = gymnasium.make_vec(NAME, num_envs=3)
+    for early in (
+        lambda: single.step(1), single.action_masks, lambda: vector.step([1, 2, 3]),
+    ):  # fmt: skip
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"^call reset before"):
+            early()
+
+
 def test_gymnasiums_checker_finds_nothing_in_one(recwarn):
     from gymnasium.utils.env_checker import check_env
 

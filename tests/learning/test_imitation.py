@@ -124,6 +124,34 @@ def measured(params, lesson):
     return learner.loss(params, attempt, jnp.int32(0))
 
 
+class Infinite(type(NETWORK)):
+    """The network, masked by minus infinity."""
+
+    def decode(self, memory, decision):
+        logits, value = super().decode(memory, decision)
+        return jnp.where(logits <= -1e9, -jnp.inf, logits), value
+
+
+def test_a_mask_of_minus_infinity_is_taken(lesson):
+    params = LEARNER.init(jax.random.key(1))
+    keys = jax.random.split(jax.random.key(0), len(lesson.best))
+
+    def of(network):
+        learner = imitation.Imitation(PPO, TASK, network)
+
+        @jax.jit
+        def gradients(params):
+            attempt, _, _ = learner.rollout(params, learner.begin(keys, lesson), lesson)
+            return jax.grad(learner.loss, has_aux=True)(params, attempt, jnp.int32(0))
+
+        return gradients(params)
+
+    found = of(Infinite(NETWORK.config))
+    assert np.isfinite(found[1]["entropy"])
+    for one, other in zip(*map(jax.tree.leaves, (of(NETWORK), found)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_the_loss_is_that_of_the_definition(lesson):
     params = LEARNER.init(jax.random.key(1))  # with key 0 two logits are a tie

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import textwrap
 import time
+import warnings
 
 import jax
 import numpy as np
@@ -181,6 +182,87 @@ def _truncate(step: pathlib.Path) -> None:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory):
+    """A run that was stopped after updates 2, 3 and 4 of 6."""
+    folder = tmp_path_factory.mktemp("brief")
+    for last in (2, 3, 4):
+        training.train(CONFIG, folder, resume=last > 2, num_updates=last)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        None,
+        lambda step: (step / "meta" / "metadata").write_text("{"),
+        lambda step: shutil.rmtree(step / "meta"),
+        lambda step: [shutil.rmtree(path) for path in step.iterdir() if path.is_dir()],
+        lambda step: _truncate(step),
+        lambda step: _exchange(step, "policy"),
+    ],
+)
+def test_a_damaged_newest_step_is_put_aside(brief, finished, tmp_path, damage, capsys):
+    """By --resume; evaluate reads the step before it, and says so."""
+    copy = tmp_path / "copy"
+    shutil.copytree(brief, copy)
+    if damage is None:
+        assert checkpoint.load(copy).meta["progress"]["updates"] == 4
+    else:
+        damage(copy / "checkpoint" / "4")
+        with pytest.warns(UserWarning, match=r"4 cannot be read.*3 is read instead$"):
+            assert checkpoint.load(copy).meta["progress"]["updates"] == 3
+    line = ["--resume", "--out", str(copy), "--no-validation", "--episodes", "384"]
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        assert command.main(line) == 0, capsys.readouterr().err
+    aside = [str(w.message) for w in warned if "damaged-4" in str(w.message)]
+    assert len(aside) == (damage is not None)
+    steps = {path.name for path in (copy / "checkpoint").iterdir()}
+    assert ("damaged-4" in steps) == (damage is not None) and "6" in steps
+    one, other = checkpoint.load(copy).params, checkpoint.load(finished[0]).params
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def _exchange(step: pathlib.Path, part: str) -> None:
+    """A part that reads well, but is of the step before."""
+    shutil.rmtree(step / part)
+    shutil.copytree(step.with_name(str(int(step.name) - 1)) / part, step / part)
+
+
+@pytest.mark.parametrize("part", ["policy", "state"])
+@pytest.mark.parametrize("summed", [True, False])
+def test_other_arrays_than_were_saved_are_damage(brief, tmp_path, part, summed):
+    steps = tmp_path / "checkpoint"
+    shutil.copytree(brief / "checkpoint", steps)
+    fresh = training.train(CONFIG, tmp_path / "fresh", num_updates=0)
+    assert checkpoint.restore(tmp_path, fresh)[1]["progress"]["updates"] == 4
+    _exchange(steps / "4", part)
+    if not summed:  # as an earlier jaxcal saved it
+        _edit(steps / "4", sha256={})
+        assert checkpoint.restore(tmp_path, fresh)[1]["progress"]["updates"] == 4
+        return
+    if part == "policy":
+        with pytest.raises(CheckpointError, match=r"damaged .*\(SHA-256 differs\)$"):
+            checkpoint.load(steps / "4")
+    else:
+        checkpoint.load(steps / "4")  # without the state
+    with pytest.warns(UserWarning, match=r"SHA-256 differs\); it is now damaged-4"):
+        assert checkpoint.restore(tmp_path, fresh)[1]["progress"]["updates"] == 3
+
+
+def test_sums_are_of_the_bits_that_are_read_again(tmp_path):
+    trees = {"a": np.float32([-0.0, np.nan, 1e-42]), "b": {"c": np.zeros((2, 1))}}
+    trees |= {"d": np.full((3, 2), -0.0, np.float32), "e": np.int32(-5)}
+    checkpoint.save(tmp_path, 1, trees, {})
+    meta = json.loads((tmp_path / "1" / "meta" / "metadata").read_text())
+    again = checkpoint._read(tmp_path / "1" / "policy", meta, trees, "read")
+    assert np.signbit(again["d"]).all()
+    narrow = jax.tree.map(lambda x: np.asarray(x, np.float16), trees)
+    checkpoint._read(tmp_path / "1" / "policy", meta, narrow, "read")  # other types
+
+
 def test_results_that_arrive_after_a_failed_read_are_ignored():
     # Orbax closes its event loop while tensorstore still reads; without this, users
     # see "Event loop is closed" below the message about a damaged checkpoint.
@@ -215,10 +297,12 @@ def test_a_finished_run_is_prolonged(finished, tmp_path, capsys):
     copy = tmp_path / "copy"
     shutil.copytree(finished[0], copy)
     line = ["--resume", "--out", str(copy), "--no-validation", "--episodes"]
-    assert command.main([*line, "384"]) == 2
-    assert "--episodes must be above 384, what the run already has, got 384" in (
+    assert command.main([*line, "383"]) == 2
+    assert "--episodes must be at least 384, what the run already has, got 383" in (
         capsys.readouterr().err
     )
+    assert command.main([*line, "384"]) == 0
+    assert checkpoint.read_meta(copy)[1]["progress"]["updates"] == 6
     assert command.main([*line, "512"]) == 0
     _, meta = checkpoint.read_meta(copy)
     assert meta["progress"]["updates"] == 8 and meta["ppo"]["num_episodes"] == 512

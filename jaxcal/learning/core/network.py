@@ -19,6 +19,7 @@ Scores = tuple[jax.Array, jax.Array]
 
 _OWN = "a Network of one's own defines this"
 _LAST = "a Network with num_unlearned > 0 defines this"
+_LEAST = -1e9  # logit of what is not available
 
 
 class Network(nn.Module):
@@ -112,4 +113,9 @@ def decode(network: Network, params: Any, memory: Any, decision: Any) -> Any:
 def mask_logits(logits: jax.Array, available: jax.Array) -> jax.Array:
     """(..., M) logits, a large finite minimum where not available: ``-inf`` would make
     the entropy, and with it every gradient, NaN."""
-    return jnp.where(available, logits, jnp.asarray(-1e9, logits.dtype))
+    return jnp.where(available, logits, jnp.asarray(_LEAST, logits.dtype))
+
+
+def log_softmax(logits: jax.Array) -> jax.Array:
+    """(..., M) log-probabilities, all finite: of logits masked by ``-inf`` too."""
+    return jax.nn.log_softmax(jnp.maximum(logits, _LEAST))

@@ -21,8 +21,7 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxcal.learning.config import TRACED, PPOConfig
-
-_LEAST = -1e9  # logit of what is not available, as ``mask_logits`` has it
+from jaxcal.learning.core.network import log_softmax
 
 Metrics = dict[str, jax.Array]
 
@@ -115,7 +114,7 @@ def surrogate(
     """Clipped surrogate, the value's error and an entropy bonus, which follows the
     updates made: ``logits`` (B, T, ..., A), masked by a large finite minimum or -inf,
     ``value`` (B, T, ...) in reward units."""
-    log_probs = jax.nn.log_softmax(jnp.maximum(logits, _LEAST))
+    log_probs = log_softmax(logits)
     taken = jnp.take_along_axis(log_probs, batch.action[..., None], axis=-1)[..., 0]
     log_ratio = taken - batch.log_prob
     ratio = jnp.exp(log_ratio)

@@ -39,23 +39,27 @@ def renewed(begin: Callable[[jax.Array], Any], done: Any, key: Any, after: Any) 
 
     @jax.custom_batching.custom_vmap
     def chosen(done: Any, key: Any, after: Any) -> Any:
-        where_done = functools.partial(jnp.where, done)
-        return jax.tree.map(where_done, begin(key), after)
+        begin_each = begin
+        for _ in done.shape:
+            begin_each = jax.vmap(begin_each)
+
+        def where_done(new: jax.Array, old: jax.Array) -> jax.Array:
+            axes = range(done.ndim, old.ndim)
+            return jnp.where(jnp.expand_dims(done, tuple(axes)), new, old)
+
+        return jax.lax.cond(
+            done.any(),
+            lambda: jax.tree.map(where_done, begin_each(key), after),
+            lambda: after,
+        )
 
     @chosen.def_vmap
     def of_batch(size: int, batched: Any, done: Any, key: Any, after: Any) -> Any:
         def whole(is_batched: Any, leaf: Any) -> Any:
             return leaf if is_batched else jnp.broadcast_to(leaf, (size, *leaf.shape))
 
-        def where_done(new: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(done.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
-
-        done, key, after = jax.tree.map(whole, batched, [done, key, after])
-        out = jax.lax.cond(
-            done.any(),
-            lambda: jax.tree.map(where_done, jax.vmap(begin)(key), after),
-            lambda: after,
-        )
+        # Itself, so that it holds under another ``vmap`` too.
+        out = chosen(*jax.tree.map(whole, batched, [done, key, after]))
         return out, jax.tree.map(lambda _: True, out)
 
     return chosen(done, key, after)

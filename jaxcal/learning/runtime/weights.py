@@ -36,19 +36,24 @@ def shipped(name: str = "default") -> pathlib.Path:
 
 
 def locate(checkpoint: str | pathlib.Path | None) -> pathlib.Path:
-    """Path of a weights file, or of the newest complete step of a run; ``checkpoint``
+    """Path of a weights file, or of the newest step of a run, see ``steps``."""
+    return steps(checkpoint)[0]
+
+
+def steps(checkpoint: str | pathlib.Path | None) -> list[pathlib.Path]:
+    """Paths of a run's steps, the newest first, or of a weights file; ``checkpoint``
     may also be a run's checkpoint folder or a step in that, None what ships."""
     path = shipped() if checkpoint is None else pathlib.Path(checkpoint)
     if path.is_file() or (path / "meta" / "metadata").is_file():
-        return path
+        return [path]
     if not path.is_dir():
         hint = " (train one with: jaxcal train)" if checkpoint is None else ""
         raise CheckpointError(f"checkpoint {path} does not exist{hint}")
     folder = path / "checkpoint" if (path / "checkpoint").is_dir() else path
-    steps = [p for p in folder.iterdir() if p.name.isdigit() and p.is_dir()]
-    if not steps:
+    held = [p for p in folder.iterdir() if p.name.isdigit() and p.is_dir()]
+    if not held:
         raise CheckpointError(f"checkpoint folder {folder} holds no checkpoint")
-    return max(steps, key=lambda step: int(step.name))
+    return sorted(held, key=lambda step: int(step.name), reverse=True)
 
 
 @dataclasses.dataclass(frozen=True)

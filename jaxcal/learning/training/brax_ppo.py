@@ -19,6 +19,7 @@ from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.presets import TrainConfig
+from jaxcal.learning.training.run import locked
 
 _READ = {  # fields of PPOConfig that brax is given: brax's names
     "learning_rate": "learning_rate",
@@ -64,19 +65,22 @@ def train(
         log_det, seconds = metrics["eval/episode_log_det"], time.perf_counter() - begun
         say(f"{steps:10,d} decisions  {seconds:7.1f} s  mean log det S {log_det:.3f}")
 
-    say("brax is compiling (about half a minute) ...")
-    environment = brax.SelectionEnv(env, task.draw, config.network)
-    _, params, _ = brax.train(environment, length, progress_fn=progress, **given)
-    meta = config.as_meta() | {
-        "network": {"kind": config.network.kind, "width": config.network.width},
-        "ppo": read | {"num_episodes": episodes},
-        "trainer": "brax",
-        "brax": {name: value for name, value in given.items() if not callable(value)},
-        "progress": {
-            "episodes": episodes,
-            "seconds": time.perf_counter() - begun,
-            "device": jax.devices()[0].device_kind,
-        },
-    }
-    policy = params[1]["params"]["network"]  # of the policy, jaxcal's network
-    checkpoint.save(pathlib.Path(folder) / "checkpoint", episodes, policy, meta)
+    with locked(pathlib.Path(folder)):
+        say("brax is compiling (about half a minute) ...")
+        environment = brax.SelectionEnv(env, task.draw, config.network)
+        _, params, _ = brax.train(environment, length, progress_fn=progress, **given)
+        meta = config.as_meta() | {
+            "network": {"kind": config.network.kind, "width": config.network.width},
+            "ppo": read | {"num_episodes": episodes},
+            "trainer": "brax",
+            "brax": {
+                name: value for name, value in given.items() if not callable(value)
+            },
+            "progress": {
+                "episodes": episodes,
+                "seconds": time.perf_counter() - begun,
+                "device": jax.devices()[0].device_kind,
+            },
+        }
+        policy = params[1]["params"]["network"]  # of the policy, jaxcal's network
+        checkpoint.save(pathlib.Path(folder) / "checkpoint", episodes, policy, meta)

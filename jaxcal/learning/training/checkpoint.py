@@ -2,8 +2,8 @@
 
 A run's folder ``checkpoint`` holds one numbered folder per save: ``policy`` (the
 averaged weights), ``state`` (what else a resumed run needs) and ``meta`` (JSON: schema,
-configuration, package versions, progress). Orbax writes a step beside the others and
-renames it, so a kill during a save leaves the previous one.
+configuration, package versions, progress, SHA-256 of the arrays). Orbax writes a step
+beside the others and renames it, so a kill during a save leaves the previous one.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ import asyncio
 import contextlib
 import dataclasses
 import datetime
+import hashlib
 import json
 import logging
 import pathlib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -29,7 +30,7 @@ from jaxcal.learning.core.network import Network, initial
 from jaxcal.learning.core.ppo import TrainState
 from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.runtime import weights
-from jaxcal.learning.runtime.weights import CheckpointError, Weights, locate
+from jaxcal.learning.runtime.weights import CheckpointError, Weights
 
 SCHEMA = "jaxcal-policy"
 VERSION = 2
@@ -83,10 +84,9 @@ def save(
     meta = header | {"created": now, "versions": versions()} | meta
     trees = {"policy": policy} | ({} if state is None else {"state": _rest(state)})
     # Arrays of the host, so that no device is recorded.
-    items = {
-        name: ocp.args.StandardSave(jax.tree.map(np.asarray, tree))
-        for name, tree in trees.items()
-    }
+    trees = jax.tree.map(np.asarray, trees)
+    meta["sha256"] = {name: _digests(tree) for name, tree in trees.items()}
+    items = {name: ocp.args.StandardSave(tree) for name, tree in trees.items()}
     options = ocp.CheckpointManagerOptions(
         max_to_keep=3,
         create=False,
@@ -162,8 +162,19 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
 
 
-def _read(path: pathlib.Path, like: Any, what: str) -> Any:
-    """A tree of arrays that orbax saved, of the shapes and types of ``like``."""
+def _digests(tree: Any) -> dict[str, str]:
+    """SHA-256 of a tree's arrays, by their types: orbax converts to others."""
+    arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(array.tobytes())
+    types = sorted({str(array.dtype) for array in arrays})
+    return {" ".join(types): digest.hexdigest()}
+
+
+def _read(path: pathlib.Path, meta: dict[str, Any], like: Any, what: str) -> Any:
+    """A tree of arrays that orbax saved, of the shapes and types of ``like``; those of
+    an earlier jaxcal have no SHA-256 in ``meta``."""
     like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), like)
     try:
         with (
@@ -174,6 +185,9 @@ def _read(path: pathlib.Path, like: Any, what: str) -> Any:
         for leaf, wanted in zip(*map(jax.tree.leaves, (tree, like)), strict=True):
             if leaf.shape != wanted.shape:
                 raise ValueError(f"shape {leaf.shape}, not {wanted.shape}")
+        ((types, digest),) = _digests(tree).items()
+        if meta.get("sha256", {}).get(path.name, {}).get(types, digest) != digest:
+            raise ValueError("SHA-256 differs")
     except Exception as error:  # orbax and tensorstore raise many kinds
         raise _unreadable(path.parent, what, error) from error
     return jax.tree.map(jax.numpy.asarray, tree)
@@ -186,9 +200,36 @@ def _unreadable(path: pathlib.Path, what: str, error: Exception) -> CheckpointEr
 def read_meta(
     checkpoint: str | pathlib.Path | None, schema: str = SCHEMA
 ) -> tuple[pathlib.Path, dict[str, Any]]:
-    """A weights file or the newest complete step of a run (``weights.locate``), and its
-    meta; a CheckpointError where there is none, it is damaged, or of another schema."""
-    path = locate(checkpoint)
+    """A weights file or the newest step of a run (``weights.steps``) whose meta is
+    whole, and that; a CheckpointError where there is none, or of another schema."""
+    return _newest(checkpoint, lambda path: (path, _meta(path, schema)))
+
+
+def _newest(
+    checkpoint: str | pathlib.Path | None, read: Callable[[pathlib.Path], Any]
+) -> Any:
+    """What ``read`` returns of the newest step that it can read; newer ones are warned
+    of."""
+    path, result, failed = _newest_whole(checkpoint, read)
+    for reason in failed.values():
+        warnings.warn(f"{reason}; {path} is read instead", stacklevel=2)
+    return result
+
+
+def _newest_whole(
+    checkpoint: str | pathlib.Path | None, read: Callable[[pathlib.Path], Any]
+) -> tuple[pathlib.Path, Any, dict[pathlib.Path, CheckpointError]]:
+    """The newest step that ``read`` can read, what it returns, and why newer failed."""
+    failed: dict[pathlib.Path, CheckpointError] = {}
+    for path in weights.steps(checkpoint):
+        try:
+            return path, read(path), failed
+        except CheckpointError as error:
+            failed[path] = error
+    raise next(iter(failed.values()))
+
+
+def _meta(path: pathlib.Path, schema: str) -> dict[str, Any]:
     if path.is_file():
         meta = weights.read(path).meta
     else:
@@ -209,13 +250,17 @@ def read_meta(
             f"be {schema}, got {held}"
         )
     weights.require_trained_by_d(path, meta)
-    return path, meta
+    return meta
 
 
 def load(checkpoint: str | pathlib.Path | None = None) -> Policy:
-    """A policy of postures, ``checkpoint`` as for ``read_meta``; with several seeds the
-    best by validation."""
-    path, meta = read_meta(checkpoint)
+    """A policy of postures, of the newest step that is whole, ``checkpoint`` as for
+    ``weights.steps``; with several seeds the best by validation."""
+    return _newest(checkpoint, _policy)
+
+
+def _policy(path: pathlib.Path) -> Policy:
+    meta = _meta(path, SCHEMA)
     try:
         network = build(NetworkConfig(**meta["network"]))
         env = meta["tasks"][0]["environment"]
@@ -241,12 +286,13 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
         typed = {n: jax.numpy.asarray(a, wanted[n].dtype) for n, a in arrays.items()}
         params = unflatten_dict(typed, sep=".")
     elif seeds == 1:
-        params = _read(path / "policy", like, what)
+        params = _read(path / "policy", meta, like, what)
     else:
         stacked = jax.tree.map(
             lambda leaf: jax.ShapeDtypeStruct((seeds, *leaf.shape), leaf.dtype), like
         )
-        every, best = _read(path / "policy", stacked, what), meta["progress"]["best"]
+        every = _read(path / "policy", meta, stacked, what)
+        best = meta["progress"]["best"]
         params = jax.tree.map(lambda leaf: leaf[best], every)
     for name, array in flatten_dict(params, sep=".").items():
         if not np.isfinite(array).all():
@@ -261,39 +307,29 @@ def restore(
 ) -> tuple[TrainState, dict[str, Any]]:
     """The training state of the newest whole step, and its meta; ``fresh`` is one of
     the same shapes. A damaged step is renamed, warned of, and the one before read."""
-    newest = locate(folder)
-    if not newest.name.isdigit():  # weights alone
-        return _restored(newest, fresh, schema)
-    every = [int(p.name) for p in newest.parent.iterdir() if p.name.isdigit()]
-    older = sorted((n for n in every if n <= int(newest.name)), reverse=True)
-    failed: dict[pathlib.Path, CheckpointError] = {}
-    for path in (newest.with_name(str(number)) for number in older):
-        try:
-            restored = _restored(path, fresh, schema)
-        except CheckpointError as error:
-            failed[path] = error
-            continue
-        for damaged, reason in failed.items():
-            aside = damaged.rename(damaged.with_name(f"damaged-{damaged.name}"))
-            warnings.warn(
-                f"{reason}; it is now {aside.name}, and the run continues from {path}",
-                stacklevel=2,
-            )
-        return restored
-    raise failed[newest]
+    path, restored, failed = _newest_whole(
+        folder, lambda path: _restored(path, fresh, schema)
+    )
+    for damaged, reason in failed.items():
+        aside = damaged.rename(damaged.with_name(f"damaged-{damaged.name}"))
+        warnings.warn(
+            f"{reason}; it is now {aside.name}, and the run continues from {path}",
+            stacklevel=2,
+        )
+    return restored
 
 
 def _restored(
     path: pathlib.Path, fresh: TrainState, schema: str
 ) -> tuple[TrainState, dict[str, Any]]:
-    _, meta = read_meta(path, schema)
+    meta = _meta(path, schema)
     if not (path / "state").exists():
         raise CheckpointError(
             f"checkpoint {path} cannot be resumed: it has no training state"
         )
     what = "resumed: its training state is damaged or was saved by an earlier jaxcal"
-    average = _read(path / "policy", fresh.average, what)
-    rest = _read(path / "state", _rest(fresh), what)
+    average = _read(path / "policy", meta, fresh.average, what)
+    rest = _read(path / "state", meta, _rest(fresh), what)
 
     def typed(leaf: Any, like: Any) -> Any:
         if not _is_key(like):

@@ -23,7 +23,13 @@ import numpy as np
 import optax
 from flax import struct
 
-from jaxcal.learning.core.network import Network, decode, encode, mask_logits
+from jaxcal.learning.core.network import (
+    Network,
+    decode,
+    encode,
+    log_softmax,
+    mask_logits,
+)
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.core.ppo import Learner, Metrics, TrainState
 from jaxcal.learning.policies import scorer
@@ -166,7 +172,7 @@ class Imitation(Postures):
         decide = functools.partial(decode, network, params, memory)
         of_each = jax.vmap(decide, in_axes=1, out_axes=1)
         logits, value = of_each(attempt.decisions)  # (B, T, M), (B, T)
-        log_probs = jax.nn.log_softmax(logits)
+        log_probs = log_softmax(logits)
         wanted_log_probs = mask_logits(log_probs, attempt.wanted)
 
         def mean(array: jax.Array) -> jax.Array:

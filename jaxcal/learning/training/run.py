@@ -201,7 +201,7 @@ def run(
     in_row = np.zeros(len(recipe.seeds), int)  # updates skipped
     with contextlib.ExitStack() as held:
         if devices.is_first():
-            held.enter_context(_locked(root))
+            held.enter_context(locked(root))
         state, before, recent = devices.on_first(lambda: _begin(root, recipe, resume))
         state = devices.replicate(state, mesh)
         done = int(np.max(devices.local(state.num_updates)))
@@ -257,7 +257,8 @@ def _broken(rows: Mapping[str, Any], number: int, update: int) -> str:
 
 
 @contextlib.contextmanager
-def _locked(root: pathlib.Path) -> Iterator[None]:
+def locked(root: pathlib.Path) -> Iterator[None]:
+    """The run folder of this training alone; made where missing."""
     root.mkdir(parents=True, exist_ok=True)
     with (root / ".lock").open("a") as file:
         if not flock(file.fileno()):
