@@ -201,6 +201,7 @@ class ArmOptions:
         used: NDArray[np.bool_] | None = None,
     ) -> Array:
         """(N, n) the columns of the commands, an arm's joints in degrees."""
+        table.require_units(columns, input_units(model, "", self.radians))
         commands = table.columns(columns, used, getattr(model, "levels", ()))
         return in_degrees(model, commands) if self.radians else commands
 
@@ -267,6 +268,21 @@ class RecordingOptions:
 def is_recording(path: str) -> bool:
     """Whether a path is of a bag or a LeRobot dataset, not of a table."""
     return os.path.isdir(path) or path.lower().endswith((".mcap", ".db3"))
+
+
+def input_units(model: Any, unit: str, radians: bool = False) -> list[str]:
+    """Units of the commands of a model, of an arm those of its joints; "" is any."""
+    if not is_arm(model):
+        return [unit]
+    turning, sliding = "rad" if radians else "deg", model.length_unit("")
+    units = [turning if kind == "deg" else sliding for kind in model.command_units]
+    return units + [""] * len(model.sensor.inputs)
+
+
+def is_arm(model: Any) -> bool:
+    """Whether a model is an arm, of which some options are."""
+    arms = sys.modules.get("jaxcal.arms.chain")  # loaded with the first arm
+    return arms is not None and isinstance(model, arms.SerialChain)
 
 
 def in_degrees(arm: SerialChain, commands: Array) -> Array:

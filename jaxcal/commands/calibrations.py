@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import sys
 from argparse import ArgumentTypeError
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar
@@ -20,6 +19,8 @@ from jaxcal.commands.arms import (
     ModelPath,
     RecordingOptions,
     in_degrees,
+    input_units,
+    is_arm,
     is_recording,
 )
 from jaxcal.commands.tables import Output, write_json, write_rows
@@ -176,15 +177,6 @@ def commands_for(
     return names, in_degrees(model, commands) if radians else commands
 
 
-def input_units(model: Any, unit: str, radians: bool = False) -> list[str]:
-    """Units of the commands of a model, of an arm those of its joints; "" is any."""
-    if not is_arm(model):
-        return [unit]
-    turning, sliding = "rad" if radians else "deg", model.length_unit("")
-    units = [turning if kind == "deg" else sliding for kind in model.command_units]
-    return units + [""] * len(model.sensor.inputs)
-
-
 def output_units(model: Any, unit: str) -> list[str]:
     """Units of the readings of a model, of an arm lengths and turns; "" is any."""
     if not is_arm(model):
@@ -194,12 +186,6 @@ def output_units(model: Any, unit: str) -> list[str]:
         if quantity.unit in ("deg", model.length_unit(unit)):
             units[quantity.columns] = [quantity.unit] * len(units[quantity.columns])
     return units
-
-
-def is_arm(model: Any) -> bool:
-    """Whether a model is an arm, of which some options are."""
-    arms = sys.modules.get("jaxcal.arms.chain")  # loaded with the first arm
-    return arms is not None and isinstance(model, arms.SerialChain)
 
 
 @dataclasses.dataclass

@@ -34,6 +34,7 @@ from jaxcal.learning.training.checkpoint import CheckpointError
 from jaxcal.learning.training.postures import Validation
 from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.run import updates
+from jaxcal.selection.policy.by_checkpoint import load_policy
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -223,6 +224,17 @@ def test_a_damaged_newest_step_is_put_aside(brief, finished, tmp_path, damage, c
     one, other = checkpoint.load(copy).params, checkpoint.load(finished[0]).params
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("step", ["3", "4"])
+def test_a_step_that_is_named_is_the_one_that_chooses(brief, step):
+    folder = brief / "checkpoint" / step
+    arrays = checkpoint.load(folder).weights.arrays
+    for name, used in load_policy(folder)._weights.items():
+        np.testing.assert_array_equal(used, arrays[name])
+    newest = load_policy(brief)._weights
+    same = all(np.array_equal(newest[name], arrays[name]) for name in arrays)
+    assert same == (step == "4")
 
 
 def _exchange(step: pathlib.Path, part: str) -> None:

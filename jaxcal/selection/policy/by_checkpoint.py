@@ -40,12 +40,14 @@ def load_policy(checkpoint: str | pathlib.Path | None = None) -> Chooser:
     """
     path = weights.locate(checkpoint)
     state = path.stat()  # a save makes another folder, an export another file
-    return _loaded(path, (state.st_mtime_ns, state.st_size, state.st_ino))
+    given = path if checkpoint is None else pathlib.Path(checkpoint)
+    return _loaded(given, path, (state.st_mtime_ns, state.st_size, state.st_ino))
 
 
 @functools.lru_cache(maxsize=8)
-def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Chooser:
-    """A weights file or a run's step; the state is what changes when it is replaced."""
+def _loaded(given: pathlib.Path, path: pathlib.Path, state: tuple[int, ...]) -> Chooser:
+    """A weights file, a run or its step as ``given``, which ``path`` is at present;
+    the state is what changes when it is replaced."""
     if path.is_file():
         stored = weights.read(path)
         held = stored.meta | {"network": stored.network}
@@ -53,13 +55,13 @@ def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Chooser:
     else:
         with needs("policy", f"checkpoint {path}, the folder of a training run,"):
             from jaxcal.learning.training import checkpoint
-        stored = checkpoint.load(path.parent).weights
+        stored = checkpoint.load(given).weights
     if stored.network["kind"] == "compact":
         from jaxcal.selection.policy.compact import CompactScorer
 
         return CompactScorer(stored.network, stored.arrays)
     with needs("policy", f"checkpoint {path}, a network other than compact,"):
-        return _ThroughJax(path if path.is_file() else path.parent)
+        return _ThroughJax(given)
 
 
 class _ThroughJax:
