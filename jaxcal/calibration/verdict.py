@@ -393,7 +393,7 @@ def outlying(fit: Fit, rows: Sequence[int]) -> Reason | None:
     if not rows:
         return None
     sigma = np.fmax(np.sqrt(fit.distance), studentised(fit)[0])[list(rows)]
-    size = " to ".join(dict.fromkeys(f"{end:.2g}" for end in (min(sigma), max(sigma))))
+    size = " to ".join(dict.fromkeys(short(end) for end in (min(sigma), max(sigma))))
     verb = "are outliers" if len(rows) > 1 else "is an outlier"
     named = in_rows(rows)
     return Reason(
