@@ -318,9 +318,9 @@ def linearised(fit: Fit, rows: Array, *, misfit: bool = True) -> tuple[Array, Ar
 def deleted(fit: Fit) -> Array:
     """(N, m) residuals from the fit without each measurement, by its mean leverage."""
     noise = np.asarray(fit.noise_std)
-    square = ((fit.residuals / np.where(noise > 0.0, noise, 1.0)) ** 2).sum(axis=1)
-    grown = fit.distance / np.where(square > 0.0, square, np.inf)
-    return np.asarray(fit.residuals * grown[:, None])
+    square = ((fit.residuals / (noise + (noise == 0.0))) ** 2).sum(axis=1)
+    off: Array = fit.residuals * (fit.distance / (square + (square == 0.0)))[:, None]
+    return off
 
 
 def studentised(fit: Fit) -> tuple[Array, float]:

@@ -246,6 +246,28 @@ def _on_its_way(fit: Fit) -> Reason | None:
     )
 
 
+def _unsigned(fit: Fit) -> Reason | None:
+    """Negative counts that were read as large ones: less 2^16 or 2^32 they fit."""
+    readings = fit.measured
+    if not (fit.model.linear and readings.max() >= 2.0**15):
+        return None
+    for bits in (16, 32):
+        whole, half = 2.0**bits, 2.0 ** (bits - 1)
+        within = (readings >= 0.0).all(axis=0) & (readings < whole).all(axis=0)
+        for j in np.flatnonzero(within & (readings >= half).any(axis=0)):
+            slopes = fit.model.jacobian(fit.commands, fit.parameters)[:, j]
+            rows = readings[:, j] >= half
+            signed = fit.residuals[:, j] - whole * rows
+            signed -= slopes @ np.linalg.lstsq(slopes, signed, rcond=None)[0]
+            if _BENT * np.linalg.norm(signed) < np.linalg.norm(fit.residuals[:, j]):
+                return Reason(
+                    f"{fit.output_names[j]} is negative in {rows.sum()} rows and was "
+                    f"read without its sign: less {whole:g} these fit.",
+                    f"subtract {whole:g} from readings of {half:g} and more",
+                )
+    return None
+
+
 def wrong_noise(fit: Fit) -> Reason | None:
     """A noise that was given and that the residuals contradict, by which factor. Too
     small where residuals are too large for it (``UNLIKELY``) and no few outliers make
@@ -411,6 +433,7 @@ Rule = Callable[["Fit"], Reason | None]
 RULES: tuple[Rule, ...] = (
     _no_noise,
     _undetermined,
+    _unsigned,
     _explains_nothing,
     _unknown,
     _far_off,

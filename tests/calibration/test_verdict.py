@@ -651,3 +651,14 @@ def test_a_line_through_an_s_is_not_good(curve, inputs, rng):
     assert jaxcal.identify(u, u + noise).verdict.good
     with pytest.warns(jaxcal.CalibrationWarning):
         assert not jaxcal.identify(u, curve(u) + noise).verdict.good
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+def test_counts_that_were_read_without_their_sign_are_told(bits, rng):
+    u = np.linspace(-9.0, 9.0, 16)[:, None]
+    y = np.round(0.05 * 2.0**bits * u + rng.normal(0.0, 20.0, u.shape))
+    assert jaxcal.identify(u, y).verdict.good
+    high = y + 0.46 * 2.0**bits
+    assert "sign" not in str(jaxcal.identify(u, high).verdict)
+    with pytest.warns(jaxcal.CalibrationWarning, match="without its sign"):
+        assert not jaxcal.identify(u, y % 2.0**bits).verdict.good
