@@ -7,6 +7,7 @@ sentence must name it and its row.
 from __future__ import annotations
 
 import csv
+import dataclasses
 import re
 import warnings
 
@@ -209,13 +210,24 @@ def test_a_mended_table_holds_no_pair_that_was_none(kind):
         assert len({command for command, _ in pairs}) == len(pairs) >= 17, seed
 
 
-def test_a_table_of_two_explanations_is_not_mended():
+def test_of_two_explanations_the_rows_are_mended_in_which_they_agree():
+    for seed in range(10):
+        u, y = (side[:20] for side in _table(seed))
+        spoilt = u, np.roll(y, 1, axis=0)
+        mispairing = _verdict(*spoilt).mispairing
+        assert mispairing.alternatives  # the last reading is another's, or the first's
+        commands, measured = mispairing.repaired(*spoilt)
+        np.testing.assert_array_equal(commands, u[:-1])
+        np.testing.assert_array_equal(measured, y[:-1])
+
+
+def test_a_table_whose_explanations_hardly_agree_is_not_mended():
     u, y = _table()
-    spoilt = u[:20], np.roll(y[:20], 1, axis=0)
-    found = _verdict(*spoilt).mispairing
-    assert found.alternatives
+    mispairing = _verdict(*_lost(u, y, 12)).mispairing
+    few = np.where(np.arange(len(mispairing.match)) < 5, mispairing.match, -1)
+    open_ = dataclasses.replace(mispairing, match=few, alternatives=("another",))
     with pytest.raises(ValueError, match="not repaired, for it is not known how"):
-        found.repaired(*spoilt)
+        open_.repaired(*_lost(u, y, 12))
 
 
 def _recording(seed, count, bend=0.0):

@@ -89,7 +89,7 @@ class Mispairing:
             raise ValueError(
                 "a table of two sessions cannot be repaired: identify each alone"
             )
-        if self.alternatives:
+        if self.alternatives and 2 * (self.match >= 0).sum() < len(self.match):
             raise ValueError(
                 f"the table is not repaired, for it is not known how: {self.reason}"
             )
@@ -339,6 +339,11 @@ def _of_all(
     if best.hypothesis.kind == _APART:
         match = path_match(len(match), best.hypothesis.starts)
     match = _certain(table, best, match, near)
+    for fit in rivals:
+        alone = fit.hypothesis.extra is None and fit.hypothesis.kind != _APART
+        if not alone or fit.hypothesis.change or best.hypothesis.change:
+            match = np.full_like(match, -1)
+        match[match != fit.hypothesis.match] = -1  # where explanations agree
     return Mispairing(
         best.hypothesis.kind,
         "; or ".join([reason, *others]),
