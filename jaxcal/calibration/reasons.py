@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jaxcal.calibration.resolution import resolution
 from jaxcal.checks import Array, Mask
 
 if TYPE_CHECKING:
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
 _FROZEN = 3  # readings after the first that repeat it
 _STEPS = 20.0  # of a sensor between readings: with fewer, some repeat by chance
-_FINEST, _ROUNDED = 1e-6, 1e-9  # of the largest reading: a sensor's step; its rounding
-COARSE = 50.0  # steps that readings must span to show one
 _EXACT = 1e-12  # of the largest reading: rounding, and no noise of a sensor
 _UNITS = np.outer([1.0, -1.0], [1.0, np.pi / 180.0, 180.0 / np.pi, 1e3, 1e-3]).ravel()
 _NAMED, _DIGITS = 6, 7  # rows in one sentence; decimals of a table
@@ -131,22 +129,6 @@ def _coarse(readings: Array) -> bool:
     counts = (levels - levels[0]) / step
     whole = np.abs(counts - counts.round()).max() < 1e-3
     return bool(whole and np.median(np.abs(np.diff(readings))) < _STEPS * step)
-
-
-def resolution(readings: Array, least: float = 0.0) -> Array:
-    """(m,) of which differences of readings (N, m) are multiples, by Euclid; 0 where
-    these have more digits than a sensor shows, or lie fewer than ``least`` apart."""
-    size = np.abs(readings).max(axis=0)
-    steps = np.zeros(readings.shape[1])
-    for j in size.nonzero()[0]:
-        for gap in (np.diff(np.unique(readings[:, j])) / size[j]).tolist():
-            while gap > _ROUNDED:
-                steps[j], gap = gap, abs(math.remainder(steps[j], gap))
-            if steps[j] < _FINEST:
-                steps[j] = 0.0
-                break
-    steps *= size
-    return np.where(np.ptp(readings, axis=0) < least * steps, 0.0, steps)
 
 
 def computed(fit: Fit) -> Reason | None:

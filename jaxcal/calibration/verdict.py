@@ -19,10 +19,10 @@ from jaxcal.calibration.reasons import (
     in_order,
     in_rows,
     never_measured,
-    resolution,
     saturated,
     short,
 )
+from jaxcal.calibration.resolution import resolution
 from jaxcal.checks import Array
 from jaxcal.late import late
 
@@ -247,7 +247,7 @@ def _on_its_way(fit: Fit) -> Reason | None:
 
 
 def _unsigned(fit: Fit) -> Reason | None:
-    """Negative counts that were read as large ones: less 2^16 or 2^32 they fit."""
+    """Negative counts that were read as unsigned: minus 2^16 or 2^32 they fit."""
     readings = fit.measured
     if not (fit.model.linear and readings.max() >= 2.0**15):
         return None
@@ -261,9 +261,9 @@ def _unsigned(fit: Fit) -> Reason | None:
             signed -= slopes @ np.linalg.lstsq(slopes, signed, rcond=None)[0]
             if _BENT * np.linalg.norm(signed) < np.linalg.norm(fit.residuals[:, j]):
                 return Reason(
-                    f"{fit.output_names[j]} is negative in {rows.sum()} rows and was "
-                    f"read without its sign: less {whole:g} these fit.",
-                    f"subtract {whole:g} from readings of {half:g} and more",
+                    f"{fit.output_names[j]}: {rows.sum()} readings are negative counts "
+                    f"that were read as unsigned; minus {whole:.0f} they fit.",
+                    f"subtract {whole:.0f} from readings of {half:.0f} and more",
                 )
     return None
 
@@ -353,8 +353,8 @@ def bends(fit: Fit) -> Reason | None:
         output, command = along
         return Reason(
             f"Residuals of {fit.output_names[output]} follow a curve along "
-            f"{fit.input_names[command]}: neighbours differ by less than half of the "
-            f"noise of {short(noise[output])}{of_unit}.",
+            f"{fit.input_names[command]}: from one row to the next they change by less "
+            f"than half of their noise of {short(noise[output])}{of_unit}.",
             "identify with a model that has it, or measure over a smaller range",
         )
     return None

@@ -123,7 +123,7 @@ class Source(abc.ABC):
         with self._lock:
             reading = self._ring[-1] if self._ring else None
         if self._ended:
-            raise ReadingError(f"receiving from {self.whose} ended: {self._ended}")
+            raise ReadingError(f"reading from {self.whose} stopped: {self._ended}")
         if reading is None:
             raise ReadingError(f"{self.whose} has sent no reading yet: {self.start}")
         now, limit = time.monotonic(), self.stale_s

@@ -226,7 +226,7 @@ def test_a_table_whose_explanations_hardly_agree_is_not_mended():
     mispairing = _verdict(*_lost(u, y, 12)).mispairing
     few = np.where(np.arange(len(mispairing.match)) < 5, mispairing.match, -1)
     open_ = dataclasses.replace(mispairing, match=few, alternatives=("another",))
-    with pytest.raises(ValueError, match="not repaired, for it is not known how"):
+    with pytest.raises(ValueError, match="several explanations fit"):
         open_.repaired(*_lost(u, y, 12))
 
 

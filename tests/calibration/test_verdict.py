@@ -659,6 +659,6 @@ def test_counts_that_were_read_without_their_sign_are_told(bits, rng):
     y = np.round(0.05 * 2.0**bits * u + rng.normal(0.0, 20.0, u.shape))
     assert jaxcal.identify(u, y).verdict.good
     high = y + 0.46 * 2.0**bits
-    assert "sign" not in str(jaxcal.identify(u, high).verdict)
-    with pytest.warns(jaxcal.CalibrationWarning, match="without its sign"):
+    assert "unsigned" not in str(jaxcal.identify(u, high).verdict)
+    with pytest.warns(jaxcal.CalibrationWarning, match="read as unsigned"):
         assert not jaxcal.identify(u, y % 2.0**bits).verdict.good

@@ -57,7 +57,7 @@ motion.TOO_FAST *= 3.0  # as fast as the simulated drives are
 
 
 def free_port() -> int:
-    """A port of this computer that nobody has, and that nobody is given."""
+    """An unused local port, outside the range from which the system assigns ports."""
     for port in PORTS:
         with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
             return port
@@ -70,8 +70,8 @@ def line_here(config, emit):
 
 
 LINES = line_here  # of sessions in this process; those of commands have their own
-# Below those that systems give out, so that no other test's connection or server gets
-# one of these between its finding here and its use.
+# Below the range from which the system assigns ports: no other test's connection or
+# server can take one before it is used.
 PORTS = itertools.count(random.SystemRandom().randrange(12_000, 30_000))
 RATE_HZ = 250.0
 MODBUS_MAPS = [n for n in available_maps() if isinstance(load_map(n), RegisterMap)]

@@ -349,7 +349,7 @@ def test_receiving_that_ended_is_said_at_once():
         raise RuntimeError("the journal is full")
 
     with Imu(changed(PLAIN, port=0, allow=("127.0.0.2",)), full) as imu:
-        with connect(imu), pytest.raises(ReadingError, match=r"ended: .* is full"):
+        with connect(imu), pytest.raises(ReadingError, match=r"stopped: .* is full"):
             imu.wait_for_stream(20.0)
 
 

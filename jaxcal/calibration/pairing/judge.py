@@ -30,7 +30,8 @@ from jaxcal.calibration.pairing.fit import (
     path_match,
     top,
 )
-from jaxcal.calibration.reasons import COARSE, froze, in_rows, resolution
+from jaxcal.calibration.reasons import froze, in_rows
+from jaxcal.calibration.resolution import COARSE, resolution
 from jaxcal.checks import Array, in_words
 from jaxcal.models.model import Model, Rows
 from jaxcal.models.uncertainty import Prior
@@ -91,7 +92,7 @@ class Mispairing:
             )
         if self.alternatives and 2 * (self.match >= 0).sum() < len(self.match):
             raise ValueError(
-                f"the table is not repaired, for it is not known how: {self.reason}"
+                f"the table cannot be repaired, several explanations fit: {self.reason}"
             )
         if self.change is not None and self.change.estimated:
             raise ValueError(

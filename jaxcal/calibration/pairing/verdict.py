@@ -16,7 +16,8 @@ from jaxcal.calibration.pairing.fit import (
     predicted,
 )
 from jaxcal.calibration.pairing.judge import LEAST, RATIO, Mispairing, better, of_fit
-from jaxcal.calibration.reasons import COARSE, Reason, in_rows, resolution
+from jaxcal.calibration.reasons import Reason, in_rows
+from jaxcal.calibration.resolution import COARSE, resolution
 from jaxcal.calibration.verdict import Verdict, bends
 from jaxcal.checks import in_words
 
