@@ -444,6 +444,34 @@ def test_a_real_arm(spoil, words):
     assert (found is None) if words is None else words in found.reason
 
 
+@pytest.mark.parametrize(
+    "columns", [[1, 0, 2], [2, 1, 0], [0, 2, 1]], ids=["xy", "xz", "yz"]
+)
+def test_an_arm_whose_readings_are_mirrored(columns):
+    """Its frame is known from the readings alone: one sign, or two columns exchanged,
+    explain them alike."""
+    joints, measured = ur5.load("ur5_grid_1000.csv")
+    at = np.random.default_rng(3).choice(1000, 25, replace=False)
+    told = _verdict(joints[at], measured[at][:, columns], model=ur5.arm()).verdict
+    assert not told.good
+    mirrored = "the readings are mirrored: one of y_x, y_y, y_z has the other sign or"
+    assert told.reasons[0].startswith(mirrored)
+
+
+@pytest.mark.parametrize("name", ["panda_1", "kuka_14"])
+def test_contacts_beside_other_sockets(name):
+    """Readings are zero: which socket is touched is what may be mispaired."""
+    joints, sockets = contacts.load(name)[contacts.TRAINED]
+    at = np.random.default_rng(6).choice(len(joints), 20, replace=False)
+    joints, sockets, model = joints[at], sockets[at, None], contacts.arm(name)
+    zeros = np.zeros((20, 3))
+    told = _verdict(np.hstack([joints, sockets]), zeros, model=model)
+    assert told.mispairing is None
+    lost = np.hstack([joints[:-1], np.delete(sockets, 9, axis=0)])
+    told = _verdict(lost, zeros[1:], model=model).mispairing
+    assert "one row early" in told.reason
+
+
 def test_contacts_that_an_arm_at_rest_would_fit_better_are_left_alone():
     joints, sockets = contacts.load("dinova_1")["left"]
     commands = np.column_stack([joints, sockets])

@@ -108,6 +108,15 @@ class Table:
         log = 0.5 * np.log(2.0 * np.pi) + np.log(self.width)
         return np.asarray((log + np.minimum(0.5 * off**2, 4.5)).sum(axis=1))
 
+    def paired(self, hypothesis: Hypothesis) -> Rows:
+        """(K,) rows whose readings have commands; what would be there twice is once."""
+        rows = np.flatnonzero((hypothesis.match >= 0) & self.counted)
+        if hypothesis.kind == AS_IT_IS or not self.sensed:
+            return rows
+        brought = self.commands[rows, self.model.fitting.sensed], self.measured[rows]
+        same = np.hstack([hypothesis.match[rows, None], *brought])
+        return rows[np.sort(np.unique(same, axis=0, return_index=True)[1])]
+
     def commands_of(self, hypothesis: Hypothesis, rows: Rows) -> Array:
         """(K, n) commands that the readings of these rows belong to."""
         commands = self.commands[hypothesis.match[rows]]
@@ -230,7 +239,7 @@ def fitted(table: Table, hypothesis: Hypothesis, theta: Array | None = None) -> 
     begins at ``theta`` (p,), where the table is linearised if None."""
     if theta is not None:
         table = dataclasses.replace(table, theta=theta)
-    rows = np.flatnonzero((hypothesis.match >= 0) & table.counted)
+    rows = table.paired(hypothesis)
     linear = table.shared or table.model.linear or not table.free.any()
     if not linear and hypothesis.extra is None:
         theta = _searched(table, hypothesis, rows)

@@ -55,7 +55,8 @@ _TREND, _TREND_OF_MANY = 1.4, 2.0  # of a sum of residuals, over their squares' 
 LEAST, _MANY = 6, 500  # rows
 _MOVED, _ROWS_ALONE = 4, 2000  # rows of one output alone: least, and the first
 _NAMED = 2  # other explanations
-_READINGS = 1.5  # for each parameter; of fewer another machine explains as much
+# For each parameter that no prior knows; of fewer another machine explains as much.
+_READINGS = 1.5
 _CHANCE = 0.02  # that so many outliers stand so near one another
 _APART = "apart"  # kind: outliers that are one block
 _FREQUENT = ("shift", "path")  # kinds that are named first among as good ones
@@ -231,7 +232,8 @@ def _table(
     first = np.unique(rows, axis=0, return_index=True)[1]
     counted = counted & np.isin(np.arange(len(rows)), first)
     readings = counted.sum() * measured.shape[1]
-    few = not model.linear and readings < _READINGS * free.sum()
+    unknown = int((free & (resolved.precisions == 0.0)).sum())
+    few = not model.linear and readings < _READINGS * unknown
     if counted.sum() < LEAST or few:
         return None
     if shared:
@@ -336,6 +338,14 @@ def _of_all(
     reason += f"; {without} the noise is {noise}"
     named = [what_is_wrong(table, fit, {}, unit) for fit in rivals]
     others = [*dict.fromkeys(x for x in named if x not in reason)][:_NAMED]
+    reason = "; or ".join([reason, *others])
+    if sum(_mirrors(fit.hypothesis.change) for fit in (best, *rivals)) > 2:
+        axes = ", ".join(outputs)
+        reason = (
+            f"the readings are mirrored: one of {axes} has the other sign or two of "
+            f"them are exchanged; compare their axes with the instrument's; {without} "
+            f"the noise is {noise}"
+        )
     match = best.hypothesis.match
     if best.hypothesis.kind == _APART:
         match = path_match(len(match), best.hypothesis.starts)
@@ -347,13 +357,22 @@ def _of_all(
         match[match != fit.hypothesis.match] = -1  # where explanations agree
     return Mispairing(
         best.hypothesis.kind,
-        "; or ".join([reason, *others]),
+        reason,
         best.noise * table.scale,
         match,
         best.hypothesis.change,
         table.model.fitting.sensed,
         tuple(others),
     )
+
+
+def _mirrors(change: ColumnChange | None) -> bool:
+    """Whether a change of readings turns a right-handed frame into a left-handed one;
+    where an arm's frame is known from its readings alone, each such explains them."""
+    if change is None or not change.of_readings or len(change.order) != 3:
+        return False
+    turn = np.eye(3)[list(change.order)] * change.factors
+    return bool(np.isclose(np.linalg.det(turn), -1.0))
 
 
 def _certain(
