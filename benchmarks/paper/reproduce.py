@@ -130,9 +130,9 @@ def _files(
     progress: Progress,
 ) -> dict[str, bytes]:
     """Everything to write, by path below the folder; the page last."""
+    from benchmarks.paper.csv_text import csv_text
     from benchmarks.paper.exhibits.page import json_document, page
     from jaxcal.reports.plots import as_files
-    from jaxcal.tables import csv_text
 
     figures = {name: f for e in exhibits for name, f in e.figures.items()}
     files: dict[str, bytes] = {}

@@ -20,10 +20,10 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.paper.csv_text import csv_text
 from jaxcal.arguments import Parser, exit_code, values_of
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.learning.runtime import weights
-from jaxcal.tables import csv_text
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Tables: one reader for files and frames, one decision for each column."""
 
 from jaxcal.tables.decisions import COMMANDS, MEASURED, Decision, columns_by_name, say
-from jaxcal.tables.files import csv_text, parse, read_table
+from jaxcal.tables.files import parse, read_table
 from jaxcal.tables.frames import (
     by_name,
     header_of,
@@ -23,7 +23,6 @@ __all__ = [
     "Table",
     "by_name",
     "columns_by_name",
-    "csv_text",
     "header_of",
     "inputs_of",
     "limits_of_frame",

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import csv
 import gzip
-import io
-import math
 import os
 import pathlib
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
-
-import numpy as np
 
 from jaxcal.checks import axis_letter
 from jaxcal.tables.cells import UNIT, decimal_mark, is_number, number_of
@@ -302,19 +298,3 @@ def _holds_units(cells: Sequence[str], rows: Sequence[tuple[int, list[str]]]) ->
     recognised = sum(bool(UNIT.fullmatch(cell)) for cell in units)
     some = any(cell != "-" for cell in units) and not any(map(is_number, units))
     return some and 2 * recognised > len(units)
-
-
-def csv_text(columns: Mapping[str, Sequence[Any] | Any], digits: int = 12) -> str:
-    """Columns of equal length as text; NaN becomes an empty cell."""
-
-    def cell(value: Any) -> str:
-        if not isinstance(value, float | np.floating):
-            return str(value)
-        return "" if math.isnan(value) else f"{value:.{digits}g}"
-
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    for row in zip(*columns.values(), strict=True):
-        writer.writerow([cell(value) for value in row])
-    return text.getvalue()

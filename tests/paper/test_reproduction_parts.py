@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 from scipy import stats
 
+from benchmarks.paper.csv_text import csv_text
 from benchmarks.paper.exhibits.devices import Device
 from benchmarks.paper.exhibits.intervals import (
     bootstrap_interval,
@@ -25,7 +26,6 @@ from benchmarks.paper.exhibits.variance import variance_table
 from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.methods import least_squares
 from jaxcal.reports.plots import as_bytes
-from jaxcal.tables import csv_text
 
 Array = NDArray[np.float64]
 
