@@ -16,8 +16,7 @@ import pathlib
 
 import numpy as np
 
-from jaxcal.designs.travel import Motion, fastest_tour, travel_times
-from jaxcal.designs.travel.search import ParetoFront
+from jaxcal.designs.travel import Motion, ParetoFront, fastest_tour, travel_times
 from jaxcal.reports.plots import numbered, panels
 from jaxcal.selection import Design, select
 

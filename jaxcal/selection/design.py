@@ -249,8 +249,8 @@ class Design:
         return problem
 
     plan = late("jaxcal.selection.plan:plan")
-    fastest = late("jaxcal.designs.travel.search:fastest")
-    pareto = late("jaxcal.designs.travel.search:pareto")
+    fastest = late("jaxcal.designs.travel:fastest")
+    pareto = late("jaxcal.designs.travel:pareto")
     refine = late("jaxcal.designs.continuous:refine")
 
     def _judged(

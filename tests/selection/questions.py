@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal import As, Design, Ds
-from jaxcal.designs.travel.search import FastSelection, ParetoFront
+from jaxcal.designs.travel import FastSelection, ParetoFront
 from jaxcal.information import criteria as information
 from jaxcal.information.regression import regressors
 from jaxcal.selection.plan import Plan

@@ -1,8 +1,10 @@
-"""Which postures, in which order, so that a run takes little time: a heuristic.
+"""Travel: how long moves take, the order of least time, and which postures to visit so
+that a run takes little time, by a heuristic.
 
-Local search from the D-optimum and local optima of the exchange swaps one posture at a
-time where that keeps the determinant and shortens the tour; random swaps then lead away
-from a local optimum.
+A move is a trapezoid profile on every axis (accelerate, cruise, brake), all axes start
+together and the slowest sets the time, which is a metric. Local search from the
+D-optimum and local optima of the exchange swaps one posture at a time where that keeps
+the determinant and shortens the tour; random swaps then lead away from a local optimum.
 """
 
 from __future__ import annotations
@@ -14,22 +16,95 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.checks import Array, Indices, array_of, seconds, share
+from jaxcal.checks import Array, Indices, array_of, numbers, seconds, share
 from jaxcal.deadline import Deadline
-from jaxcal.designs.travel.motion import Motion, travel_times
+from jaxcal.designs.tour_kernel import best_order
 from jaxcal.selection.design import Design
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.problem import CandidateSet, problem_of
 from jaxcal.selection.solvers import checked_seed
+from jaxcal.tables import require_unnamed
 
-SAME_TIME = 1e-9  # seconds: two runs this close take as long
+_SAME_TIME = 1e-9  # seconds: two runs this close take as long
 _STARTS = 12  # the D-optimum and local optima of the exchange
 _KICKS = 20  # random changes of the best run found, from which to search again
 _KICK_TRIES = 50  # swaps drawn until one keeps the determinant
 _MOST_POINTS = 200  # of a front, which is then not proven
 _RIDGE = 1e-8  # of the whitened information of fewer postures than identify
 _TRIED = 8  # most promising swaps that are put in their best order
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """How the device moves; in the unit of the candidates and seconds."""
+
+    speed: tuple[float, ...]  # (n,) or one for all axes, unit/s
+    acceleration: tuple[float, ...]  # likewise, unit/s^2; also the deceleration
+    settle: float = 0.0  # s at every posture, before and while measuring
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "acceleration"):
+            require_unnamed(name, getattr(self, name))
+            values = numbers(name, getattr(self, name))
+            if values.ndim > 1 or not values.size or (values <= 0.0).any():
+                raise ValueError(
+                    f"{name} must be positive: one number, or one per axis, got "
+                    f"{getattr(self, name)!r}"
+                )
+            object.__setattr__(self, name, tuple(np.atleast_1d(values).tolist()))
+        settle = numbers("settle", self.settle)
+        if settle.ndim or settle < 0.0:
+            raise ValueError(f"settle must be at least 0 seconds, got {self.settle!r}")
+
+
+def travel_times(points: ArrayLike, others: ArrayLike, motion: Motion) -> Array:
+    """(A, B) seconds from each of postures (A, n) to others (B, n), not settling.
+
+    An axis that moves d at speed v and acceleration a takes ``d / v + v / a``, or ``2
+    sqrt(d / a)`` where it never reaches v (d < v^2 / a); the slowest axis counts.
+    """
+    a, b = numbers("points", points), numbers("others", others)
+    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
+        raise ValueError(
+            f"points and others must be (A, n) and (B, n), got {a.shape} and {b.shape}"
+        )
+    speed, ramp = np.array(motion.speed), np.array(motion.acceleration)
+    for name, limit in (("speed", speed), ("acceleration", ramp)):
+        if len(limit) not in (1, n := a.shape[1]):
+            raise ValueError(f"motion.{name} must hold 1 or {n}, got {len(limit)}")
+    way = np.abs(a[:, None] - b[None])
+    cruise = way >= speed**2 / ramp
+    seconds = np.where(cruise, way / speed + speed / ramp, 2.0 * np.sqrt(way / ramp))
+    return seconds.max(axis=2)
+
+
+def fastest_tour(
+    times: ArrayLike, start: ArrayLike | None = None
+) -> tuple[Indices, float]:
+    """(K,) order of least time through all postures, ending anywhere, and its seconds.
+
+    Optimal up to 12 postures (Held and Karp 1962); beyond, the shortest
+    nearest-neighbour tours are improved by 2-opt and moves of single postures.
+
+    Args:
+        times: (K, K) seconds from each posture to each, symmetric.
+        start: (K,) seconds to each from where the device stands; any when not given.
+    """
+    between = np.ascontiguousarray(numbers("times", times))
+    k = len(between) if between.ndim else 0
+    if between.shape != (k, k) or not k:
+        raise ValueError(f"times must have shape (K, K), got {between.shape}")
+    uneven = np.abs(between - between.T)
+    if uneven.max() > 1e-9 * max(float(np.abs(between).max()), 1.0):
+        i, j = np.unravel_index(uneven.argmax(), uneven.shape)
+        raise ValueError(
+            "times must be symmetric, got "
+            f"{between[i, j]:g} from {i} to {j} and {between[j, i]:g} back"
+        )
+    begin = np.zeros(k) if start is None else array_of("start", start, k)
+    order, seconds = best_order(between, begin)
+    return order, float(seconds)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -115,7 +190,7 @@ def pareto(
         points.append(point)
         point = search.answer(least, point.log_det)
     for point in sorted(points, key=lambda point: -point.log_det):
-        if not front or point.seconds < front[-1].seconds - SAME_TIME:
+        if not front or point.seconds < front[-1].seconds - _SAME_TIME:
             front.append(point)
     return ParetoFront(tuple(front[::-1]), least)
 
@@ -179,14 +254,14 @@ class _TourSearch:
         wanted = optimum.bound / m - scale + problem.num_regressors * np.log(least)
         wanted -= 1e-12
         if above is not None:
-            wanted = max(wanted, above / m - scale + SAME_TIME)
+            wanted = max(wanted, above / m - scale + _SAME_TIME)
         rng = np.random.default_rng(self.seed)
         chosen, travel = self._local(wanted, rng)
         if chosen is None:
             return None
         for _ in range(_KICKS):
             other, after = self._shortened(self._kicked(chosen, wanted, rng), wanted)
-            if after < travel - SAME_TIME:
+            if after < travel - _SAME_TIME:
                 chosen, travel = other, after
         tour, travel = self._tour(chosen)
         log_det = problem.log_det(self.pool[tour])
@@ -211,7 +286,7 @@ class _TourSearch:
             start = place[np.searchsorted(self.pool, indices, sorter=place)]
             if self._log_det(start) >= wanted:
                 chosen, travel = self._shortened(start, wanted)
-                if travel < least - SAME_TIME:
+                if travel < least - _SAME_TIME:
                     best, least = chosen, travel
         return best, least
 
@@ -242,7 +317,7 @@ class _TourSearch:
             for _, tried in sorted(swaps, key=lambda swap: swap[0])[:_TRIED]:
                 if self._log_det(tried) >= wanted:
                     shorter, reached = self._tour(tried)
-                    if reached < travel - SAME_TIME:
+                    if reached < travel - _SAME_TIME:
                         tour, travel = shorter, reached
                         break
             else:
@@ -284,9 +359,6 @@ class _TourSearch:
 
     def _tour(self, chosen: Indices) -> tuple[Indices, float]:
         """``chosen`` (k,) in the best order found, and its seconds of travel."""
-        from jaxcal.designs.travel.tour_kernel import best_order
-
-        order, travel = best_order(
-            self.times[np.ix_(chosen, chosen)], self.start[chosen]
-        )
+        between = self.times[np.ix_(chosen, chosen)]
+        order, travel = best_order(between, self.start[chosen])
         return chosen[order], float(travel)
