@@ -21,7 +21,7 @@ from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.policy import select_batch
-from jaxcal.selection.policy.compact import CompactScorer
+from jaxcal.selection.policy.by_checkpoint import CompactScorer
 from jaxcal.selection.policy.policy_kernel import look_ahead
 from jaxcal.selection.problem import make_problems
 

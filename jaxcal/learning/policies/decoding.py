@@ -1,7 +1,7 @@
 """Turning scores into a choice: greedy, sampled, best of the likeliest first picks.
 
 A ``Scorer`` is the network in JAX (``policies.scorer``) or the compact one in numpy
-(``selection.policy.compact``). Needs no JAX. B candidate sets, E episodes (a set and
+(``selection.policy``). Needs no JAX. B candidate sets, E episodes (a set and
 the choices made from it), M candidates, K choices in all, p regressors of a candidate.
 """
 
