@@ -57,6 +57,7 @@ def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str], dict[str, Le
     with needs("models", "a formula"):
         from formulaic import Formula
         from formulaic.errors import FormulaicError
+        from formulaic.parser import DefaultFormulaParser
 
     try:
         terms = list(Formula(formula, _ordering="none"))
@@ -70,7 +71,7 @@ def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str], dict[str, Le
             f"features must be the right-hand side of a formula, got {formula!r}"
             + (f": {why}" if why else "")
         ) from error
-    _require_powers(formula)
+    _require_powers([DefaultFormulaParser().get_ast(formula)])
     used: set[str] = set()
     categories: dict[str, Levels] = {}
     whole = {frozenset(parts) for _, parts in factors}
@@ -132,27 +133,21 @@ def _indicators(name: str, levels: Levels) -> list[tuple[str, Factor]]:
     return [(f"{name}[{level}]", at(i, level)) for i, level in enumerate(levels)]
 
 
-def _require_powers(formula: str) -> None:
+def _require_powers(nodes: list[Any]) -> None:
     """A formula takes the product of a factor with itself for the factor: refused."""
-    calls: list[str] = []
-
-    def hide(call: re.Match[str]) -> str:
-        if call[0] not in calls:
-            calls.append(call[0])
-        return f"_{calls.index(call[0])}_"
-
-    plain, count = formula, 1
-    while count:  # calls whose arguments hold none, the innermost first
-        plain, count = re.subn(r"\w+\([^()]*\)", hide, plain)
-    itself = r"\b([^\W\d]\w*)\s*(?:(?:\*\*|\^)\s*(\d+)|[:*]\s*\1\b(?!\())"
-    if power := re.search(itself, plain):
-        name, whole = power[1], power[0]
-        for k in reversed(range(len(calls))):
-            name, whole = (x.replace(f"_{k}_", calls[k]) for x in (name, whole))
-        raise ValueError(
-            f"features: a formula reads {whole} as {name}; for a power write "
-            f"I({name}**{power[2] or 2})"
-        )
+    for node in nodes:
+        parts: list[Any] = getattr(node, "args", [])
+        nodes += parts
+        if len(parts) < 2 or hasattr(parts[0], "args") or str(parts[0]).isdecimal():
+            continue
+        symbol, factor, other = node.operator.symbol, str(parts[0]), str(parts[1])
+        raised = symbol in ("**", "^")
+        if raised or (symbol in (":", "*") and factor == other):
+            power = other if raised else "2"
+            raise ValueError(
+                f"features: a formula reads {factor}{symbol}{other} as {factor}; for a "
+                f"power write I({factor}**{power})"
+            )
 
 
 def input_names(used: set[str]) -> tuple[str, ...]:
