@@ -396,13 +396,6 @@ def as_model(model: Any) -> Model:
     return _Adapter(model)
 
 
-def of_arm(model: Any, name: str) -> Any:
-    """What only arms have, by its name; a ValueError of another model."""
-    if not hasattr(model, name):
-        raise ValueError(f"the model must be an arm, got {as_model(model)._kind}")
-    return getattr(model, name)
-
-
 def as_commands(model: Any, commands: ArrayLike) -> Array:
     """``commands`` as finite float64 (N, n); of a data frame the model's columns."""
     if type(commands) is not np.ndarray or commands.dtype.names:
@@ -443,7 +436,9 @@ def recorded(model: Any, commands: Any, measured: Any) -> tuple[Any, Any, bool]:
     if is_recording:
         if model is None:
             raise ValueError("commands are a recording: model must be an arm")
-        commands, read = of_arm(model, "recorded")(commands)
+        if not hasattr(model, "recorded"):
+            raise ValueError(f"the model must be an arm, got {as_model(model)._kind}")
+        commands, read = model.recorded(commands)
         measured = read if measured is None else measured
     elif measured is None and getattr(
         getattr(model, "sensor", None), "contacts", False
