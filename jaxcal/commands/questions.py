@@ -64,7 +64,7 @@ class DesignOptions:
             scenarios=self.scenarios,
             names=table.row_names,
         )
-        design.candidate_set.axes = names
+        design.axes = names
         return design
 
 

@@ -159,7 +159,7 @@ def fastest(
         ValueError: also of scenarios and replicates, which have no such run.
     """
     least = share("least_efficiency", least_efficiency)
-    search = _TourSearch(design.candidate_set, k, motion, start, time_limit, seed)
+    search = _TourSearch(design, k, motion, start, time_limit, seed)
     answer = search.answer(least, None)
     if answer is None:
         raise ValueError(
@@ -183,7 +183,7 @@ def pareto(
     ``k``, ``motion`` and the options start, seed and time_limit are as in ``fastest``.
     """
     least = share("least_efficiency", least_efficiency)
-    search = _TourSearch(design.candidate_set, k, motion, **options)
+    search = _TourSearch(design, k, motion, **options)
     points, front = list[FastSelection](), list[FastSelection]()
     point = search.answer(least, None)
     while point is not None and len(points) < _MOST_POINTS:

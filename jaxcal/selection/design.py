@@ -6,23 +6,19 @@ import dataclasses
 import inspect
 import math
 import time
-from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.checks import Indices, one_of, require_known, require_none, seconds
 from jaxcal.deadline import Deadline
 from jaxcal.late import late
-from jaxcal.models.model import Model
-from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
 from jaxcal.selection.exchange.exchange import fewest_regular
 from jaxcal.selection.problem import (
     CandidateSet,
     Problem,
-    Scenarios,
     Solution,
     problem_of,
 )
@@ -33,7 +29,7 @@ _LARGE_S = 0.1  # to make a problem: of a larger one time_limit takes account
 _PROVEN = 1e-9  # a value this near a proven optimum, relative above 1, is that optimum
 
 
-class Design:
+class Design(CandidateSet):
     """The problem of choosing a few of these candidates, and its methods.
 
     Args:
@@ -72,35 +68,6 @@ class Design:
             is asked.
     """
 
-    candidate_set: CandidateSet  # what is asked about
-
-    def __init__(
-        self,
-        candidates: ArrayLike | None = None,
-        model: Model | None = None,
-        prior: Prior | ArrayLike | None = None,
-        noise: Noise | ArrayLike | None = None,
-        measured: ArrayLike | None = None,
-        available: ArrayLike | None = None,
-        required: ArrayLike | None = None,
-        max_replicates: ArrayLike = 1,
-        *,
-        blocks: ArrayLike | None = None,
-        commands: ArrayLike | None = None,
-        scenarios: Any = None,
-        constraints: Any = None,
-        names: Sequence[str] | None = None,
-    ) -> None:
-        if (candidates is None) == (blocks is None):
-            got = "neither" if blocks is None else "both"
-            raise ValueError(f"give either candidates or blocks, got {got}")
-        rows: Any = candidates if blocks is None else commands
-        labels: Any = names
-        self.candidate_set = CandidateSet(
-            rows, model, prior, noise, measured, available, required, max_replicates,
-            blocks, scenarios, labels, constraints=constraints,
-        ).checked()  # fmt: skip
-
     @classmethod
     def from_blocks(
         cls,
@@ -114,22 +81,12 @@ class Design:
         return cls(blocks=blocks, prior=prior, scenarios=weights, **rules)
 
     @property
-    def available(self) -> NDArray[np.bool_]:
-        """(M,) True where a candidate may be chosen."""
-        return self.candidate_set.available
-
-    @property
-    def scenarios(self) -> Scenarios | None:
-        """Parameters (S, p) and weights (S,); None: the nominal alone."""
-        return self.candidate_set.scenarios
-
-    @property
-    def axes(self) -> tuple[str, ...] | None:
-        """(n,) of the inputs, the caller's own."""
-        return self.candidate_set.axes
+    def candidate_set(self) -> Self:
+        """Itself, whose attributes are the arguments, checked."""
+        return self
 
     def __repr__(self) -> str:
-        model, usable = self.candidate_set.model, self.available
+        model, usable = self.model, self.available
         what = "blocks" if model is None else type(model).__name__
         return f"Design of {len(usable)} candidates, {usable.sum()} available, {what}"
 
@@ -137,7 +94,7 @@ class Design:
         self, k: int | None = None, criterion: Any = None, region: Any = None
     ) -> Problem:
         """The problem of choosing k, the fewest that identify if None."""
-        return problem_of(self.candidate_set, k, criterion, region)
+        return problem_of(self, k, criterion, region)
 
     def select(
         self,
@@ -280,16 +237,14 @@ class Design:
             indices, value, log_det, solution.method or method, solution.proven,
             time.perf_counter() - start, problem, solution.reason, solution.seed,
             solution.restarts, solution.nodes, tuple(Subset(*x) for x in best),
-            solution.bound, self.candidate_set.names, self.axes,
+            solution.bound, self.names, self.axes,
         )  # fmt: skip
 
     def _why_singular(self, indices: Indices) -> str:
         """What choosing among these candidates alone would be refused for."""
         usable, k = np.isin(np.arange(len(self.available)), indices), len(indices)
-        alone = dataclasses.replace(
-            self.candidate_set, available=usable, required=None, max_replicates=k,
-            constraints=None,
-        )  # fmt: skip
+        rules = {"required": None, "max_replicates": k, "constraints": None}
+        alone = self.but(available=usable, **rules)
         try:
             problem_of(alone, len(indices))
         except ValueError as error:

@@ -160,7 +160,7 @@ def plan(
         ValueError: naming the argument, the rule and the value; where no K up to
             ``max_k`` suffices, with the accuracy that can be reached.
     """
-    begun, offer = time.perf_counter(), design.candidate_set
+    begun, offer = time.perf_counter(), design
     one_of("criterion", criterion, tuple(_SUMMARIES))
     more, start = whole_number("more", more, 0), checked_seed(seed)
     requests = [
@@ -410,9 +410,9 @@ def _request(
     if model is not None and std is not None:
         shared = not of_parameters and shares_regressor(model, offer.prior, None)
         # Where outputs share a regressor the noise is in the targets.
-        offer = dataclasses.replace(offer, noise=None if shared else Noise(std))
+        offer = offer.but(noise=None if shared else Noise(std))
     problem = problem_of(offer, total, "D")
-    blocks = blocks_of(dataclasses.replace(offer, noise=None), not shared)
+    blocks = blocks_of(offer.but(noise=None), not shared)
     region = offer.by_name("region", region)
     names, rows = blocks.names, _region_rows(blocks, problem, region)
     if of_parameters:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.designs import bound
+from jaxcal.designs import continuous
 from jaxcal.models import (
     Affine,
     Board,
@@ -131,13 +131,13 @@ def test_the_bound_of_e_is_that_of_the_weighted_optimum():
 
 def test_the_bound_takes_no_round_twice(monkeypatch):
     """It took twelve here, ten of them from the same weights of the same support."""
-    rounds, weighted = [], bound._weights
+    rounds, weighted = [], continuous._weights
 
     def noted(ascent, blocks, weights):
         rounds.append(weights)
         return weighted(ascent, blocks, weights)
 
-    monkeypatch.setattr(bound, "_weights", noted)
+    monkeypatch.setattr(continuous, "_weights", noted)
     jaxcal.optimise([[-1.0, 1.0]] * 3, 6, Affine(3, 1), criterion="I", starts=2)
     pairs = itertools.pairwise(rounds)
     steps = [np.abs(a - b).max() for a, b in pairs if len(a) == len(b)]

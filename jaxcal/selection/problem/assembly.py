@@ -76,8 +76,8 @@ def _problem_of_one(
     offer: CandidateSet, k: int | None, criterion: Criterion
 ) -> Problem:
     """The problem of one scenario, or at the nominal."""
-    volume = criterion.name == "D"
-    blocks = blocks_of(offer, criterion.by_name, criterion.of_region, volume)
+    about = criterion.by_name, criterion.of_region, criterion.name == "D"
+    blocks = blocks_of(offer, *about)
     raw, root = blocks.of_candidates(), blocks.root
     if offer.measured is not None:
         measured = blocks.at("measured", offer.measured, readings=True)
@@ -89,10 +89,8 @@ def _problem_of_one(
     if where is None and criterion.of_region:
         where = blocks.predicted()
     region = None if where is None else blocks.at("region", where, readings=False)
-    names, times = blocks.names, blocks.times
-    return _checked_problem(
-        offer, raw, root, criterion, k, names=names, times=times, region=region
-    )
+    more: dict[str, Any] = {"names": blocks.names, "times": blocks.times}
+    return _checked_problem(offer, raw, root, criterion, k, region=region, **more)
 
 
 def _of_largest(problems: list[Problem]) -> Problem:
@@ -123,12 +121,8 @@ def make_problems(
     max_replicates: int = 1,
     num_outputs: int | None = None,
 ) -> list[Problem]:
-    """The problems of candidate sets (B, M, n) of the affine model, for criterion D.
-
-    Args:
-        available: (B, M); ``required`` (B, r); the others as of ``Design``.
-        num_outputs: m; as many as inputs when not given.
-    """
+    """The problems of candidate sets (B, M, n) of the affine model, for criterion D;
+    ``available`` (B, M), ``required`` (B, r), the others as of ``Design``."""
     array = filled("candidates", candidates, "B", "M", "n")
     mask = check_available(available, array.shape[:2])
     array = usable_numbers("candidates", array, mask)
@@ -146,12 +140,14 @@ def make_problems(
     root, criterion = np.zeros((0, model.num_inputs + 1)), CRITERIA["D"]()
     white = whiten(raw, mask, root)
     k = _check_k(k, raw[0], mask[0], root, regressors=True)  # of no one set
+    first = CandidateSet(array[0], model, max_replicates=max_replicates)
     problems = []
     for b in range(len(array)):
-        offer = CandidateSet(
-            array[b], model, available=mask[b], max_replicates=max_replicates,
+        offer = first.but(
+            candidates=array[b],
+            available=mask[b],
             required=None if forced is None else forced[b],
-        )  # fmt: skip
+        )
         rest = offer, raw[b], root, criterion, k
         try:
             problems.append(_checked_problem(*rest, white=white[b], times=m))
@@ -172,14 +168,8 @@ def _checked_problem(
     times: int = 1,
     region: Array | None = None,
 ) -> Problem:
-    """The problem of checked blocks (M, q, p), zero where not available; whitened here.
-
-    Args:
-        white: the blocks whitened, where they are already.
-        names: (p,) of the parameters; empty where the blocks are [u, 1].
-        times: how often log det and trace count.
-        region: (R, q, p) blocks that the criterion is about, if it is of a region.
-    """
+    """The problem of checked blocks (M, q, p), zero where not available, whitened here
+    unless they are; ``names`` are empty where they are [u, 1], ``region`` (R, q, p)."""
     available, candidates = offer.available, offer.candidates
     readings, count = raw, int(np.count_nonzero(available)) * raw.shape[1]
     if raw.shape[1] > raw.shape[2]:  # as much information in p rows, at q^3 less cost
@@ -188,8 +178,6 @@ def _checked_problem(
         raw = np.asarray(np.linalg.qr(raw, mode="r"))
     k = _check_k(k, raw, available, root, regressors=not names)
     cap = offer.max_replicates
-    if np.ndim(cap) == 0:
-        cap = whole_number("max_replicates", cap, 1)
     _require_enough(available, k, cap)
     forced = _checked_required(offer.required, available, k)
     computed = bool(names) and offer.model is not None

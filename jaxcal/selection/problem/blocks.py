@@ -71,13 +71,9 @@ class Blocks:
 
 
 class _ModelBlocks(Blocks):
-    """Blocks of a model by its parameters, without those that are held.
-
-    Args:
-        misfit: standard deviation of a reading by what no parameter explains.
-        invariant: commands may be counted from their middle, which neither the
-            determinant nor predictions depend on.
-    """
+    """Blocks of a model by its parameters, without those that are held; ``misfit`` is
+    the std of a reading by what no parameter explains, ``invariant``: commands may be
+    counted from their middle."""
 
     def __init__(
         self, offer: CandidateSet, model: Model, misfit: float, invariant: bool
@@ -179,13 +175,9 @@ def blocks_of(
     of_predictions: bool = False,
     of_volume: bool = False,
 ) -> Blocks:
-    """The blocks of a candidate set.
-
-    Args:
-        of_parameters: by name, also where outputs share a regressor.
-        of_predictions: those of an arm without a prior have what no parameter explains.
-        of_volume: their determinant alone counts.
-    """
+    """Blocks of a candidate set: ``of_parameters`` by name, also where outputs share a
+    regressor; ``of_predictions``, which of an arm without a prior have what no
+    parameter explains; ``of_volume``, whose determinant alone counts."""
     model, prior = offer.model, offer.prior
     if model is None:
         return Blocks(offer)

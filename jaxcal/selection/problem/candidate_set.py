@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
@@ -25,7 +24,7 @@ from jaxcal.checks import (
 from jaxcal.models.linear import Affine
 from jaxcal.models.model import Model, as_model
 from jaxcal.models.predictions import answered
-from jaxcal.models.uncertainty import Prior, as_noise
+from jaxcal.models.uncertainty import Noise, Prior, as_noise
 from jaxcal.selection.problem.problem import checked_constraints
 from jaxcal.tables import (
     COMMANDS,
@@ -97,49 +96,69 @@ def checked_weights(weights: ArrayLike | None, count: int) -> Array:
     return checked / total
 
 
-@dataclasses.dataclass(eq=False, repr=False)
 class CandidateSet:
-    """Candidates or blocks with the rules, as ``Design`` takes them."""
+    """Candidates or blocks with the rules, checked; arguments of ``Design``."""
 
-    candidates: Any  # (M, n) commands in the caller's unit, finite; None: blocks alone
-    model: Any = None  # a Model; None where blocks are given
-    prior: Any = None  # a Prior, of blocks a (p, p) precision, as given
-    noise: Any = None  # a Noise, as given or the model's own
-    measured: Any = None  # commands (N, n), blocks (N, q, p), of scenarios (S, N, q, p)
-    available: Any = None  # (M,) bool
-    required: Any = None  # candidates that must be chosen, as given
-    max_replicates: Any = 1  # how often one candidate may be chosen, or (M,)
-    blocks: Any = None  # (M, q, p), of S scenarios (M, S, q, p), where given
-    scenarios: Any = None  # a Scenarios; None: the nominal alone
-    names: tuple[str, ...] | None = None  # (M,) of the candidates, the caller's own
     axes: tuple[str, ...] | None = None  # (n,) of the inputs, the caller's own
+    max_replicates: Any  # how often one candidate may be chosen, or (M,)
     parameters: Array | None = None  # (p,) of one scenario; None: the nominal's
-    constraints: Any = None  # a Constraints on the counts; None: no more of them
 
-    def checked(self) -> Self:
-        """Itself, its fields checked and the caller's arrays copied."""
-        self.noise = as_noise(self.noise)
-        if self.blocks is None:
+    def __init__(
+        self,
+        candidates: ArrayLike | None = None,
+        model: Model | None = None,
+        prior: Prior | ArrayLike | None = None,
+        noise: Noise | ArrayLike | None = None,
+        measured: ArrayLike | None = None,
+        available: ArrayLike | None = None,
+        required: ArrayLike | None = None,
+        max_replicates: ArrayLike = 1,
+        *,
+        blocks: ArrayLike | None = None,
+        commands: ArrayLike | None = None,
+        scenarios: Any = None,
+        constraints: Any = None,
+        names: Sequence[str] | None = None,
+    ) -> None:
+        if (candidates is None) == (blocks is None):
+            got = "neither" if blocks is None else "both"
+            raise ValueError(f"give either candidates or blocks, got {got}")
+        # Checked, the caller's arrays copied; of blocks "candidates" are the commands.
+        self.candidates: Any = candidates if blocks is None else commands
+        self.model: Any = model  # None where blocks are given
+        self.prior: Any = prior  # a Prior, of blocks a (p, p) precision, as given
+        self.noise: Any = as_noise(noise)  # as given, or the model's own
+        self.measured: Any = measured  # (N, n), blocks (N, q, p) or (S, N, q, p)
+        self.available: Any = available
+        self.required = copy.deepcopy(required)
+        self.blocks: Any = blocks  # (M, q, p), of S scenarios (M, S, q, p)
+        self.scenarios: Any = scenarios  # a Scenarios; None: the nominal alone
+        self.names: Any = names  # (M,) of the candidates, the caller's own
+        if blocks is None:
             self._check_commands()
         else:
             self._check_blocks()
-        self._check_counts()
-        self.required = copy.deepcopy(self.required)
-        return self
+        self._check_counts(max_replicates, constraints)
 
-    def _check_counts(self) -> None:
-        """Caps of the candidates, and constraints on how often they are chosen."""
-        count, caps = len(self.available), one_array("replicates", self.max_replicates)
+    def but(self, **changes: Any) -> Self:
+        """A copy with other attributes, which are taken as checked."""
+        other = copy.copy(self)
+        vars(other).update(changes)
+        return other
+
+    def _check_counts(self, max_replicates: ArrayLike, constraints: Any) -> None:
+        """How often a candidate may be chosen, a number or (M,), and in all."""
+        self.constraints = checked_constraints(constraints, len(self.available))
+        caps = one_array("replicates", max_replicates)
         if caps.ndim == 0:
             self.max_replicates = whole_number("max_replicates", caps[()], 1)
-        else:
-            rule = "max_replicates must be a whole number, or (M,) of them from 0"
-            if caps.shape != (count,) or caps.dtype.kind not in "iu":
-                raise ValueError(f"{rule}, got {caps.dtype} of shape {caps.shape}")
-            self.max_replicates = often = caps.astype(np.int64)
-            require_none(often < 0, often, rule)
-            self.available = self.available & (often > 0)
-        self.constraints = checked_constraints(self.constraints, count)
+            return
+        rule = "max_replicates must be a whole number, or (M,) of them from 0"
+        if caps.shape != self.available.shape or caps.dtype.kind not in "iu":
+            raise ValueError(f"{rule}, got {caps.dtype} of shape {caps.shape}")
+        self.max_replicates = often = caps.astype(np.int64)
+        require_none(often < 0, often, rule)
+        self.available = self.available & (often > 0)
 
     def _check_commands(self) -> None:
         """Commands (M, n) of a model, or a frame."""
@@ -258,7 +277,7 @@ class CandidateSet:
         """The candidates in each scenario alone; where there are none, as they are."""
         if self.scenarios is None:
             return [self]
-        alone = []
+        alone: list[CandidateSet] = []
         for s in range(len(self.scenarios.weights)):
             changes: dict[str, Any] = {"scenarios": None}
             if self.scenarios.parameters is not None:
@@ -267,7 +286,7 @@ class CandidateSet:
                 changes["blocks"] = np.ascontiguousarray(self.blocks[:, s])
                 if self.measured is not None:
                     changes["measured"] = self.measured[s]
-            alone.append(dataclasses.replace(self, **changes))
+            alone.append(self.but(**changes))
         return alone
 
 
@@ -350,14 +369,12 @@ def flatten_rounding(
     *,
     bias: bool = False,
 ) -> None:
-    """Put blocks that lie in a plane but for rounding to float32 into it, in place.
-
-    In double precision that rounding would pass for information, and be proven so.
+    """Put blocks (M, q, p), of which the ``usable`` (M,) count, that lie in a plane but
+    for rounding to float32 into it, in place, and ``measured`` (N, q, p) with them. In
+    double precision that rounding would pass for information, and be proven so.
 
     Args:
         spacing: of the caller's numbers, see ``rounding_of``; 0: nothing is done.
-        blocks: (M, q, p), of which the ``usable`` (M,) count.
-        measured: (N, q, p) put into the plane with them.
         bias: a column of ones stands beside them, so the plane need not pass through 0.
     """
     if not spacing or not usable.any():

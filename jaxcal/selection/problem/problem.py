@@ -57,10 +57,7 @@ class Constraints:
 
     def selection(self, k: int, lower: Indices, upper: Indices) -> Indices | None:
         """Counts (M,) of sum k within bounds that keep all rules; None: there are none.
-
-        Raises:
-            ValueError: the search for them did not end.
-        """
+        A ValueError where the search for them did not end."""
         from scipy import optimize
 
         within = optimize.LinearConstraint(
