@@ -233,12 +233,8 @@ def _add(
 
 @contextlib.contextmanager
 def told(at_end: bool = False) -> Iterator[None]:
-    """What jaxcal logs inside the block is shown on standard error.
-
-    Args:
-        at_end: once the block is done, and nothing where it fails: an error is then
-            the only line.
-    """
+    """What jaxcal logs inside the block is shown on standard error; ``at_end``, and not
+    where it fails: an error is then the only line."""
     lines: Any = io.StringIO() if at_end else sys.stderr
     log, shown = logging.getLogger("jaxcal"), logging.StreamHandler(lines)
     level = log.level
@@ -254,10 +250,8 @@ def told(at_end: bool = False) -> Iterator[None]:
 
 
 def typed_line(program: str) -> str:
-    """``train.py`` or ``jaxcal train`` as it is typed in this shell.
-
-    A script is where the one that runs is.
-    """
+    """``train.py``, where the script that runs is, or ``jaxcal train`` as it is typed
+    in this shell."""
     name, *more = program.split()
     if not name.endswith(".py"):
         return " ".join([typed(name), *more])

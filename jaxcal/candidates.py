@@ -15,13 +15,7 @@ __all__ = ["JointRanges"]
 
 
 class JointRanges:
-    """Least and greatest command of each axis.
-
-    Attributes:
-        low: (n,).
-        high: (n,) above ``low``.
-        span: (n,) high - low.
-    """
+    """Least and greatest command of each axis: ``low`` (n,), ``high`` and ``span``."""
 
     def __init__(self, low: ArrayLike, high: ArrayLike) -> None:
         self.low, self.high = numbers("low", low), numbers("high", high)

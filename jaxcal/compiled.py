@@ -45,17 +45,9 @@ def kernel(name: str) -> Any:
 
 
 def check(package: pathlib.Path) -> None:
-    """One line on stderr where a kernel is older than its source.
-
-    None where ``UNCHECKED`` is set, as by a program that calls no kernel.
-
-    Args:
-        package: folder of a package in a checkout; an installed one holds no sources.
-
-    Raises:
-        ImportError: a kernel was never compiled for this Python: neither ``pip install
-        .`` nor ``pip install -e .`` was run with it in this checkout.
-    """
+    """One line on stderr where a kernel of a package in a checkout is older than its
+    source; an ImportError where it was never compiled for this Python. None where
+    ``UNCHECKED`` is set, as by a program that calls no kernel."""
     if UNCHECKED in os.environ:
         return
     missing, older = [], []

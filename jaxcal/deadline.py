@@ -7,11 +7,8 @@ import time
 
 
 class Deadline:
-    """The time at which a search stops; it begins to run when it is made.
-
-    Args:
-        limit_s: seconds from now; infinite where the search ends by itself.
-    """
+    """The time at which a search stops: ``limit_s`` from when it is made, infinite
+    where the search ends by itself."""
 
     def __init__(self, limit_s: float = math.inf) -> None:
         self._begun = time.perf_counter()

@@ -22,15 +22,8 @@ class MissingExtraError(ImportError):
 
 @contextlib.contextmanager
 def needs(extra: str, purpose: str) -> Iterator[None]:
-    """Imports inside the block belong to an extra of jaxcal.
-
-    Args:
-        extra: "gym", "lerobot", "live", "models", "plots", "policy", "rig", "ros" or
-            "study".
-        purpose: what needs it, as the subject of a sentence: ``'method="policy"'``.
-
-    Raises:
-        MissingExtraError: one of them is not installed.
+    """Imports inside the block belong to an extra of jaxcal: a MissingExtraError where
+    one of them is not installed, whose subject is ``purpose``: ``'method="policy"'``.
     """
     try:
         yield
@@ -45,10 +38,8 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
 
 
 def typed(program: str) -> str:
-    """A program of this Python's environment as it is typed here.
-
-    Its name where the shell finds it, else its path: ``python``, ``.venv/bin/jaxcal``.
-    """
+    """A program of this Python's environment as it is typed here: its name where the
+    shell finds it, else its path: ``python``, ``.venv/bin/jaxcal``."""
     beside = pathlib.Path(sys.executable)
     if program != "python":
         beside = beside.with_name(program)

@@ -19,12 +19,9 @@ _RECORDS = {".json", ".jsonl", ".toml", ".csv"}
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
-    """A binary file to fill; it takes the place of ``path`` when the block succeeds.
-
-    The bytes go to a new file in the same folder, reach the disk (fsync) and are then
-    renamed over ``path``. If the block raises or the process dies, ``path`` is what it
-    was. OSError: the folder is missing, not writable or full.
-    """
+    """A binary file to fill, in the same folder; once on the disk (fsync) it is renamed
+    over ``path``. If the block raises or the process dies, ``path`` is what it was.
+    OSError: the folder is missing, not writable or full."""
     target = pathlib.Path(path).resolve()
     if target.exists() and not target.is_file():
         kind = "folder" if target.is_dir() else "device"
@@ -74,13 +71,8 @@ def write_over(path: str | os.PathLike[str], text: str, force: bool) -> None:
 
 
 def require_writable_folder(folder: str | os.PathLike[str]) -> None:
-    """Make sure files can be written to ``folder`` before work is spent on them.
-
-    A folder that does not exist is not made: its nearest existing ancestor is tried.
-
-    Raises:
-        OSError: it is a file, or nothing can be written there.
-    """
+    """An OSError where ``folder``, or its nearest ancestor that exists, is a file or
+    takes no files, before work is spent on them."""
     place = pathlib.Path(folder).resolve()
     while not os.path.lexists(place) and place != place.parent:
         place = place.parent
@@ -97,11 +89,7 @@ def require_writable_folder(folder: str | os.PathLike[str]) -> None:
 
 
 def require_kept(given: Mapping[str, Any]) -> None:
-    """Refuse arguments that would write over a file they read, by any path to it.
-
-    Raises:
-        ValueError: naming the option and the file.
-    """
+    """Refuse arguments that would write over a file they read, by any path to it."""
     written = {name: given.get(name) for name in _WRITTEN}
     if folder := given.get("report"):
         require_writable_folder(folder)

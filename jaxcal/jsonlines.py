@@ -103,12 +103,8 @@ class JsonLines:
 def read_records(
     path: pathlib.Path, whole: Callable[[int, Record], bool]
 ) -> tuple[list[Record], int]:
-    """Records, and the bytes that their lines take.
-
-    Raises:
-        DamagedError: a record before the last is not whole.
-        OSError: it cannot be read.
-    """
+    """Records, and the bytes that their lines take; a DamagedError where one before the
+    last is not whole."""
     records: list[Record] = []
     size = 0
     *lines, tail = path.read_bytes().split(b"\n")

@@ -216,14 +216,10 @@ def prior_root(precision: Array) -> Array:
 def rank_of_blocks(
     blocks: Array, root: Array, size: Array | None = None
 ) -> tuple[list[int], Array]:
-    """Ranks and natural log det (S,), -inf where singular, of information blocks.
-
-    Args:
-        blocks: (S, N, q, p), the N of each of S sets measured together.
-        root: (r, p) of the prior precision, r = 0 without one.
-        size: (p,) of what the blocks were computed beside, the largest of a model's
-            derivatives; None: they are the caller's own numbers.
-    """
+    """Ranks and natural log det (S,), -inf where singular, of information blocks
+    (S, N, q, p), the N of each set measured together, and a prior's root (r, p).
+    ``size`` (p,) is the largest of the derivatives that the blocks were computed
+    beside; None: they are the caller's own numbers."""
     if not blocks.shape[1]:  # the prior alone
         blocks = np.broadcast_to(root, (len(blocks), 1, *root.shape))
         root = root[:0]

@@ -115,11 +115,8 @@ OPTIONS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
 
 
 def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that a method reads, checked; defaults where they are not given.
-
-    Raises:
-        ValueError: an option is unknown, has a bad value, or belongs to other methods.
-    """
+    """The options that a method reads, checked; defaults where they are not given. A
+    ValueError where one is unknown, has a bad value, or belongs to other methods."""
     one_of("method", method, tuple(SOLVERS))
     reads = _options(SOLVERS[method])
     checked = {name: OPTIONS[name][0] for name in reads if name in OPTIONS}

@@ -66,11 +66,8 @@ def unit_of(text: str) -> str:
 
 
 def decimal_mark(cells: Sequence[str], semicolons: bool) -> tuple[str, bool]:
-    """The decimal mark of a table's cells, and whether a cell decides it.
-
-    With ``semicolons``, or other marks than commas between the cells, 1,234 has
-    decimals.
-    """
+    """The decimal mark of a table's cells, and whether a cell decides it; with
+    ``semicolons``, or other marks than commas between them, 1,234 has decimals."""
     if not any("," in cell or cell.count(".") > 1 for cell in cells):
         return ".", True
     marked = [*filter(_MARKED.fullmatch, map(_plain, cells))]

@@ -271,11 +271,8 @@ def columns_by_name(
     wanted: Sequence[str], header: Sequence[str], prefix: str, unit: str = ""
 ) -> list[Any]:
     """For each of the wanted the column of its name, or that which differs by the
-    prefix or the unit alone; None where there is none.
-
-    Raises:
-        ValueError: two columns could be one of the wanted, or one is two of them.
-    """
+    prefix or the unit alone; None where there is none. A ValueError where two could be
+    one of the wanted, or one is two of them."""
     exact = set(wanted) & set(header)
     rest = [(name, bare(name, prefix, unit)) for name in header if name not in exact]
     matches: list[str | None] = []

@@ -24,10 +24,7 @@ _ENDS = ("low", "high"), ("min", "max")  # of limits, by name
 
 def header_of(argument: str, values: Any) -> list[str]:
     """Names of the columns of a frame, or of a row's numbers; [] where there are none.
-
-    Raises:
-        ValueError: a name comes twice or is no text; a row has another.
-    """
+    A ValueError where one comes twice or is no text, or a row has another."""
     names = _names(values)
     if not any(isinstance(name, str | tuple) for name in names):
         return []

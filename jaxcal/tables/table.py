@@ -352,10 +352,8 @@ def table_of(
     row: str = "line",
     units: Mapping[str, str] | None = None,
 ) -> Table:
-    """The table of columns of cells, or of numbers (N,).
-
-    ``mark`` is what ``decimal_mark`` says of all cells; None: of each column by itself.
-    """
+    """The table of columns of cells, or of numbers (N,); ``mark`` is what
+    ``decimal_mark`` says of all cells, None: of each column by itself."""
     numeric: dict[str, Any] = {}
     table = Table(source, (), np.empty((len(lines), 0)), {}, tuple(lines), headed, row)
     marked = any(name.startswith(COMMANDS) for name in columns)

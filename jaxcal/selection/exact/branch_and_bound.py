@@ -167,11 +167,8 @@ def branch_and_bound(
 
 
 def _price(search: Any, rules: Constraints, begun: Array, deadline: Deadline) -> Array:
-    """Have the search keep the rules, at prices that make the bound at the root least.
-
-    Any prices from 0 give true bounds; these are optimum by cutting planes (Kelley).
-    Returns (M,) counts where the relaxation ended.
-    """
+    """(M,) counts where the relaxation ends that keeps the rules, at the prices that
+    make its bound least, by cutting planes (Kelley): any from 0 give true bounds."""
     from scipy import optimize
 
     size = np.abs(rules.costs).max(axis=1, initial=0.0)
@@ -220,10 +217,8 @@ def _incumbents(best: int, num_blocks: int) -> tuple[Array, Array, Indices]:
 def _near_one(
     blocks: Array, prior: Array, criterion: Criterion, start: Indices, upper: Indices
 ) -> tuple[Array, float, float, float]:
-    """The kernel's C, with values of phi near 1, and their unit, origin and largest.
-
-    The largest is that of everything measured as often as it may be.
-    """
+    """The kernel's C, with values of phi near 1, and their unit, origin and largest,
+    that of everything measured as often as it may be."""
     root, form = criterion.root, criterion.form
     everything = prior + _information(blocks, upper)
     if form == "det":
