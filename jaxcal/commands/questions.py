@@ -239,9 +239,9 @@ def _rows_of(subset: Table, table: Table) -> NDArray[np.int64]:
         ~np.isclose(in_subset, in_table, rtol=1e-9, atol=0.0)
     ):
         raise ValueError(
-            f"{subset.source}: line {subset.lines[row]}, column {shared[place]!r} is "
-            f"{in_subset[row, place]:g}, but row {rows[row]} of {table.source} has "
-            f"{in_table[row, place]:g}. This selection is from another table"
+            f"{subset.cell(row, shared[place])} is {in_subset[row, place]:g}, but row "
+            f"{rows[row]} of {table.source} has {in_table[row, place]:g}. This "
+            "selection is from another table"
         )
     return rows
 

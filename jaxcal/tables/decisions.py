@@ -174,26 +174,17 @@ def _counting(table: Any, decisions: dict[str, Decision]) -> dict[str, Decision]
     reasons = [_count(column) for column in columns]
     if None not in reasons:
         return {}  # all are swept together: a table of one axis, say
-    counting = {
-        name: Decision("left out", reason, asks=True)
-        for name, reason in zip(names, reasons, strict=True)
-        if reason is not None and not decisions[name].reason
-    }
     marks = [{*np.unique(column)} == {0.0, 1.0} for column in columns]
-    if False in marks:
-        counting |= {
-            name: Decision("input", _MARKS)
-            for name, mark in zip(names, marks, strict=True)
-            if mark and not decisions[name].reason
-        }
     doubts = [_doubt(column) for column in columns]
-    if None in doubts:
-        counting |= {
-            name: Decision("input", _LIKE_COUNT.format(doubt))
-            for name, doubt in zip(names, doubts, strict=True)
-            if doubt and name not in counting and not decisions[name].reason
-        }
-    return counting
+    counting = {}
+    for name, reason, mark, doubt in zip(names, reasons, marks, doubts, strict=True):
+        if mark and False in marks:
+            counting[name] = Decision("input", _MARKS)
+        elif reason is not None:
+            counting[name] = Decision("left out", reason, asks=True)
+        elif doubt and None in doubts:
+            counting[name] = Decision("input", _LIKE_COUNT.format(doubt))
+    return {name: x for name, x in counting.items() if not decisions[name].reason}
 
 
 def _count(column: Array) -> str | None:

@@ -57,11 +57,13 @@ def read_table(path: Any) -> Table:
 
 def parse(source: str, data: bytes) -> Table:
     """The table in the bytes of a file; ``source`` is its name in errors."""
-    text, note = decoded(source, data)
+    note = ""
     try:
+        text, note = _decoded(data)
         table, notes = _of_text(source, text)
     except ValueError as error:
-        raise ValueError(f"{error}; {note}" if note else str(error)) from None
+        fault = str(error).removeprefix(f"{source}: ") + (f"; {note}" if note else "")
+        raise ValueError(f"{source}: {fault}") from None
     if notes := [*filter(None, [note]), *notes]:
         say(f"{source}: {'; '.join(notes)}")
     return table
@@ -69,47 +71,45 @@ def parse(source: str, data: bytes) -> Table:
 
 def _of_text(source: str, text: str) -> tuple[Table, list[str]]:
     """The table in a text, and what is to be said of how it was read."""
-    rows, delimiter, headed, units, notes = sheet_of(source, text)
+    rows, delimiter, headed, units, notes = _sheet_of(text)
     _, header = rows[0]
     mark = decimal_mark([cell for _, row in rows for cell in row], delimiter != ",")
     if not headed:
-        _require_decimals(source, rows, delimiter)
+        _require_decimals(rows, delimiter)
         header = [f"u_{axis_letter(i, len(header))}" for i in range(len(header))]
     elif numbers := [cell for cell in header if _is_plain(cell)]:
         name = next(cell for cell in header if not _is_plain(cell))
         raise ValueError(
-            f"{source}: line {rows[0][0]} mixes names and numbers, {name!r} and "
+            f"line {rows[0][0]} mixes names and numbers, {name!r} and "
             f"{numbers[0]!r}: give every column a name"
         )
     elif not (rows := rows[1:]):
-        raise ValueError(f"{source}: no rows below the header")
+        raise ValueError("no rows below the header")
     columns = dict[str, Sequence[str]]()
     for place, name in enumerate(header, start=1):
         cells = [row[place - 1] for _, row in rows]
         if header.count(name) > 1 and name:
-            raise ValueError(f"{source}: column {name!r} comes twice")
+            raise ValueError(f"column {name!r} comes twice")
         if name:
             columns[name] = cells
         elif any(cells):
-            notes += _unnamed(source, place, cells, columns)
+            notes += _unnamed(place, cells, columns)
     lines = tuple(line for line, _ in rows)
     named = dict(zip(header, units, strict=False))
     table = table_of(source, columns, lines, mark, headed=headed, units=named)
     if not table.names:
-        raise ValueError(f"{source}: no column contains numbers: {', '.join(header)}")
+        raise ValueError(f"no column contains numbers: {', '.join(header)}")
     return table, notes
 
 
-def _require_decimals(
-    source: str, rows: list[tuple[int, list[str]]], delimiter: str
-) -> None:
+def _require_decimals(rows: list[tuple[int, list[str]]], delimiter: str) -> None:
     """Refuse numbers that decimal commas have cut into two cells each: -0,79."""
     width = len(rows[0][1])
     whole = all(cell.lstrip("+-").isdecimal() for _, row in rows for cell in row)
     for line, row in rows if whole and delimiter == "," and width % 2 == 0 else ():
         if any(cell in ("-0", "+0") or re.match(r"0\d", cell) for cell in row):
             raise ValueError(
-                f"{source}: line {line} may hold {width // 2} numbers with decimal "
+                f"line {line} may hold {width // 2} numbers with decimal "
                 f"commas, or {width} whole ones: separate cells with semicolons"
             )
 
@@ -119,7 +119,7 @@ def _is_plain(cell: str) -> bool:
 
 
 def _unnamed(
-    source: str, place: int, cells: Sequence[str], columns: dict[str, Sequence[str]]
+    place: int, cells: Sequence[str], columns: dict[str, Sequence[str]]
 ) -> list[str]:
     """What is said of a column without a name, a frame's index; words are labels."""
     if not any(map(_is_plain, cells)) and "index" not in columns:
@@ -127,15 +127,15 @@ def _unnamed(
         return []
     if len({*cells}) == len(cells) and all(cell.isdecimal() for cell in cells):
         return [f"ignored column {place} (looks like a row number)"]
-    raise ValueError(f"{source}: column {place} has no name")
+    raise ValueError(f"column {place} has no name")
 
 
-def decoded(source: str, data: bytes) -> tuple[str, str]:
+def _decoded(data: bytes) -> tuple[str, str]:
     """The text of a file, and a note where it is not UTF-8."""
     if data.startswith(b"\x1f\x8b"):
         data = gzip.decompress(data)
     if data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"PAR1", b"{", b"<")):
-        raise ValueError(f"{source}: a table must be CSV; save this one as CSV")
+        raise ValueError("a table must be CSV; save this one as CSV")
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         return data.decode("utf-16", errors="replace"), ""
     if data[1::2].count(0) > len(data) // 4:
@@ -149,14 +149,12 @@ def decoded(source: str, data: bytes) -> tuple[str, str]:
         text = data.decode("cp1252", errors="replace")
     if bad := re.search("[\x00-\x08\x0e-\x1f\ufffd]", text):
         line = text.count("\n", 0, bad.start()) + 1
-        raise ValueError(
-            f"{source}: line {line} is not UTF-8 text; save it as UTF-8"
-        ) from None
+        raise ValueError(f"line {line} is not UTF-8 text; save it as UTF-8") from None
     return text, note
 
 
-def sheet_of(
-    source: str, text: str
+def _sheet_of(
+    text: str,
 ) -> tuple[list[tuple[int, list[str]]], str, bool, list[str], list[str]]:
     """Rows of a text, line and as many cells each, without comments and row of units;
     the delimiter; whether the first row holds names; the units; what is to be said."""
@@ -167,9 +165,9 @@ def sheet_of(
         lines[0] = ""
     lines, comment = _without_comments(lines, notes)
     delimiter = stated[1] if stated else _delimiter(lines)
-    rows = _rows(source, lines, delimiter)
+    rows = _rows(lines, delimiter)
     if not rows:
-        raise ValueError(f"{source}: the table is empty")
+        raise ValueError("the table is empty")
     if comment and all(map(is_number, rows[0][1])):
         line, text = comment
         for mark in (delimiter, " "):
@@ -259,14 +257,9 @@ def _cells(lines: Sequence[str], delimiter: str) -> list[tuple[int, list[str]]]:
     return [(line, [_BREAK.sub(" ", cell) for cell in cells]) for line, cells in rows]
 
 
-def _rows(
-    source: str, lines: Sequence[str], delimiter: str
-) -> list[tuple[int, list[str]]]:
+def _rows(lines: Sequence[str], delimiter: str) -> list[tuple[int, list[str]]]:
     """Rows of as many cells each; empty ones beyond the header are left out."""
-    try:
-        rows = _cells(lines, delimiter)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
+    rows = _cells(lines, delimiter)
     width = len(rows[0][1]) if rows else 0
     numbered = all(row[0] == str(i) for i, (_, row) in enumerate(rows[1:], 1))
     if (
@@ -282,7 +275,7 @@ def _rows(
             cells.pop()
         if len(cells) != width:
             raise ValueError(
-                f"{source}: line {line} has {len(cells)} cells, the first has {width}"
+                f"line {line} has {len(cells)} cells, the first has {width}"
             )
     return rows
 

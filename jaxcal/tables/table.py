@@ -93,11 +93,14 @@ class Table:
         bad = ~np.isfinite(values)
         for row, place in np.argwhere(bad if used is None else bad & used[:, None]):
             raise ValueError(
-                f"{self.source}: {self.row} {self.lines[row]}, column "
-                f"{wanted[place]!r} must hold a number, got {values[row, place]} or an "
-                "empty cell; fill it or leave the row out"
+                f"{self.cell(row, wanted[place])} must hold a number, got "
+                f"{values[row, place]} or an empty cell; fill it or leave the row out"
             )
         return values
+
+    def cell(self, row: int, name: str) -> str:
+        """Where a cell stands, in words."""
+        return f"{self.source}: {self.row} {self.lines[row]}, column {name!r}"
 
     def named(
         self,
@@ -277,11 +280,9 @@ class Table:
         """(N,) the words of a column, or its numbers; none may be missing."""
         if name not in self.labels:
             return self.columns([name])[:, 0]
-        for line, cell in zip(self.lines, self.labels[name], strict=True):
+        for row, cell in enumerate(self.labels[name]):
             if not cell:
-                raise ValueError(
-                    f"{self.source}: {self.row} {line}, column {name!r} is empty"
-                )
+                raise ValueError(f"{self.cell(row, name)} is empty")
         return self.labels[name]
 
     def say_available(self, *read: str | None) -> None:
@@ -367,9 +368,8 @@ def table_of(
             cell = cells[place]
             plain = cell.replace(",", "").replace(".", "")
             raise ValueError(
-                f"{source}: {row} {lines[place]}, column {name!r}: {cell!r} may mean "
-                f"{plain} or a number with three decimals: write {plain}, or a fourth "
-                "decimal"
+                f"{table.cell(place, name)}: {cell!r} may mean {plain} or a number "
+                f"with three decimals: write {plain}, or a fourth decimal"
             )
         must = name.startswith(COMMANDS) or (marked and name.startswith(MEASURED))
         truths = truths_of(cells, ("true", "false")) if must else None
@@ -396,12 +396,10 @@ def _places(
     """The place of each word among the levels."""
     places = {level.strip(): float(place) for place, level in enumerate(levels)}
     places[""] = np.nan  # refused where its row is used
-    for line, cell in zip(table.lines, cells, strict=True):
+    for row, cell in enumerate(cells):
         if cell.strip() not in places:
-            raise ValueError(
-                f"{table.source}: {table.row} {line}, column {name!r} must be one of "
-                f"{', '.join(levels)}, got {cell!r}"
-            )
+            rule = f"must be one of {', '.join(levels)}, got {cell!r}"
+            raise ValueError(f"{table.cell(row, name)} {rule}")
     return [places[cell.strip()] for cell in cells]
 
 
@@ -410,10 +408,8 @@ def _require_numbers(
 ) -> NoReturn:
     """Refuse a column of cells by the first that is no number."""
     numbers = numbers or [number_of(cell) for cell in cells]
-    for line, cell, number in zip(table.lines, cells, numbers, strict=True):
-        if number is None:
-            raise ValueError(
-                f"{table.source}: {table.row} {line}, column {name!r} must hold a "
-                f"number, got {cell!r}; correct it, or leave the row or column out"
-            )
-    raise AssertionError(name)
+    row = [number is None for number in numbers].index(True)
+    raise ValueError(
+        f"{table.cell(row, name)} must hold a number, got {cells[row]!r}; correct it, "
+        "or leave the row or column out"
+    )
