@@ -54,6 +54,7 @@ class Ascent:
     scale: Array  # (S,) ``scale phi + shift`` of a scenario is what is joined
     shift: Array  # (S,)
     block_makers: list[Blocks]  # (S,)
+    question: tuple[Any, Any]  # criterion and region, as given
 
     @property
     def smooth(self) -> bool:
@@ -203,8 +204,9 @@ def ascent_of(
         worst, alone = joint.criterion.least, offer.by_scenario()
     makers = [blocks_of(one, inner.by_name, inner.of_region) for one in alone]
     return Ascent(
-        offer, box, problem, seed, deadline, inner, worst, weights, scale, shift, makers
-    )
+        offer, box, problem, seed, deadline, inner, worst, weights, scale, shift,
+        makers, (criterion, region),
+    )  # fmt: skip
 
 
 def squares(blocks: Array) -> Array:

@@ -136,7 +136,7 @@ def optimise(
         drawn, model, prior, noise, measured, max_replicates=POOL, **more
     )
     ascent = ascent_of(offer, box, k, criterion, region, seed, deadline)
-    return _refined(ascent, criterion, region, None, starts)
+    return _refined(ascent, None, starts)
 
 
 def refine(
@@ -195,7 +195,7 @@ def refine(
         )
     starts = whole_number("starts", starts, 1)
     ascent = ascent_of(offer, box, len(begun), criterion, region, seed, deadline)
-    return _refined(ascent, criterion, region, begun, starts)
+    return _refined(ascent, begun, starts)
 
 
 def _range(commands: Array, allowed: Allowed | None) -> Array:
@@ -221,9 +221,7 @@ def _same_criterion(selection: Selection) -> Any:
     return criterion.name
 
 
-def _refined(
-    ascent: Ascent, criterion: Any, region: Any, begun: Array | None, starts: int
-) -> Refinement:
+def _refined(ascent: Ascent, begun: Array | None, starts: int) -> Refinement:
     """The best from ``begun`` (k, n), and other starts."""
     offer, criterion_within = ascent.offer, ascent.problem.criterion
     first_phi = -np.inf if begun is None else ascent.phi_of(begun)
@@ -242,7 +240,7 @@ def _refined(
     best, best_phi = swapped(ascent, best, best_phi)
     bound, certain = upper_bound(ascent, best, best_phi)
     began = np.nan if begun is None else float(criterion_within.reported(first_phi))
-    problem = _judged(ascent, best, criterion, region)
+    problem = _judged(ascent, best)
     value, log_det = problem.values(np.arange(len(best))[None])
     return Refinement(
         np.arange(len(best)), float(value[0]), float(log_det[0]),
@@ -286,9 +284,10 @@ def _among(problem: Problem, available: NDArray[np.bool_]) -> Problem:
     return dataclasses.replace(problem, **rules)
 
 
-def _judged(ascent: Ascent, commands: Array, criterion: Any, region: Any) -> Problem:
+def _judged(ascent: Ascent, commands: Array) -> Problem:
     """The problem of commands (k, n), which come first, and all candidates."""
     offer, joint = ascent.offer, ascent.problem.joint
+    criterion, region = ascent.question
     pool = offer.candidates[offer.available]
     of_one = getattr(criterion, "criterion", criterion)
     if region is getattr(of_one, "region", None) is None and ascent.each.of_region:
