@@ -28,8 +28,7 @@ from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
 from rig.core.device import Device, Posture
 from rig.core.motion import move
-from rig.faults import Fault, StopRequested
-from rig.signals import Signals
+from rig.faults import Fault, Signals, StopRequested
 from rig_workbench.simulator import Simulator, Truth, parse_fault
 
 SLOW = {

@@ -12,14 +12,13 @@ from rig.config.axis import Pulses
 from rig.core.device import Device
 from rig.core.record_check import ZeroRecord
 from rig.core.session import SessionRun, open_device, take_zero
-from rig.faults import EXIT_FAULT, JournalError, Refused, ending
+from rig.faults import EXIT_FAULT, JournalError, Refused, Signals, ending
 from rig.journal.device import DeviceRecord
 from rig.journal.run_folder import Record
 from rig.outputs.messages import event_lines, numbers
 from rig.outputs.run_state import RunState
 from rig.outputs.telemetry import telemetry
 from rig.parts import model_of
-from rig.signals import Signals
 
 
 class Run(SessionRun):
@@ -71,12 +70,10 @@ class Run(SessionRun):
         lost = {record["name"] for record in self.journal.events("unreachable")}
         return not lost.union(self.postures()).issuperset(names)
 
-    @contextlib.contextmanager
-    def armed(self) -> Iterator[Device]:
+    def armed(self) -> contextlib.AbstractContextManager[Device]:
         """The device, armed once the operator has confirmed it."""
         self.confirm(self)
-        with open_device(self) as device:
-            yield device
+        return open_device(self)
 
     @contextlib.contextmanager
     def device(self) -> Iterator[Device]:

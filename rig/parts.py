@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from rig.config import RigConfig
     from rig.journal.run_folder import Record
-    from rig.readings.attitude import Array
+    from rig.readings.geometry import Array
 
 STEPS = {  # commands that are typed after another one
     "setup": ("home", "axes", "zero", "jog", "characterise"),

@@ -259,17 +259,17 @@ def map_of(text: str, folder: pathlib.Path, faults: Faults) -> SimpleNamespace |
     set_zero = drive_map.set_zero
     drive_map.home_place = set_zero.place_of("home") if set_zero else None
     status = _near(data, "status")
-    if (value := _value(status, "u16")) and isinstance(status, dict):
+    if value := _value(status, "u16"):
         bits = {name: _bits(status.get(name)) for name in FLAGS}
         if bits["done"] and bits["moving"]:
             never = Bits(set=(0,), clear=(0,))
             bits["fault"] = bits["fault"] or never
             drive_map.status = Flags(**vars(value), **bits)
-    if drive_map.drive == "modbus" and drive_map.stop is None:
-        faults.append(f"the map {drive_map.name} has no readable [stop]")
+    name, modbus = drive_map.name, drive_map.drive == "modbus"
+    if modbus and drive_map.stop is None:
+        faults.append(f"the map {name} has no readable [stop]")
         return None
-    if drive_map.drive == "modbus" and not (drive_map.status and drive_map.position):
-        name = drive_map.name
+    if modbus and not (drive_map.status and drive_map.position):
         faults.append(f"[status] or [position] of the map {name} cannot be read")
     return drive_map
 
@@ -280,9 +280,8 @@ def _frames(table: Any) -> Frames | None:
         frames = []
         for row in rows:
             listed = row["words"] if isinstance(row["words"], list) else [row["words"]]
-            numbers = [_register(word) for word in listed]
-            pairs = zip(listed, numbers, strict=True)
-            words = tuple(word_of(w if n is None else n) for w, n in pairs)
+            numbers = ((word, _register(word)) for word in listed)
+            words = tuple(word_of(w if n is None else n) for w, n in numbers)
             function = row.get("function")
             if count_of(words) > 1 or function not in (5, 6, 16):
                 function = 6 if count_of(words) == 1 else 16
@@ -315,12 +314,12 @@ def _register(value: Any) -> int | None:
 
 
 def _bits(table: Any) -> Bits | None:
-    if not isinstance(table, dict):
-        return None
-    lists: list[Any] = [table.get(name) for name in ("set", "clear")]
-    lists = [numbers if type(numbers) is list else [] for numbers in lists]
-    bits = [tuple(bit for bit in numbers if type(bit) is int) for numbers in lists]
-    return Bits(set=bits[0], clear=bits[1]) if any(bits) else None
+    bits = {}
+    for name in ("set", "clear"):
+        numbers = _table(table).get(name)
+        listed = numbers if type(numbers) is list else []
+        bits[name] = tuple(number for number in listed if type(number) is int)
+    return Bits(**bits) if any(bits.values()) else None
 
 
 def _table(value: Any) -> dict[str, Any]:

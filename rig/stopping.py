@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from rig.drives import make_drives
 from rig.drives.line import BusError
-from rig.faults import EXIT_FAULT, EXIT_OK, Fault, Refused, told
+from rig.faults import EXIT_FAULT, EXIT_OK, Fault, Refused, Signals, told
 from rig.journal.lock import BusLock, armed_files, held_by, read_armed
 from rig.stop_config import FILE, StopConfig, found, read_file
 from rig.stop_config import read_armed as config_of
@@ -118,8 +118,6 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
     """Stop what is armed on the bus of rig.toml, else all that sessions of this user
     have armed; 0 if all drives stand. ``given``: an operator named the file. Fault: no
     drive was told to stop."""
-    from rig.signals import Signals
-
     with Signals() as signals:
         signals.armed = True  # it takes seconds at most: a signal does not cut it short
         targets = _targets(path, given)

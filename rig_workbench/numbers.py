@@ -19,7 +19,7 @@ import numpy as np
 from rig.config.settings import BusSettings, ReadingsSettings
 from rig.drives.bus import Bus
 from rig.drives.modbus import decoded
-from rig.readings.attitude import Array, Reading
+from rig.readings.geometry import Array, Reading
 from rig.readings.source import JumpGate, ReadingError, Receiver
 
 NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{0,17})?(?:[eE][+-]?[0-9]{1,2})?")

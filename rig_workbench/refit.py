@@ -17,8 +17,7 @@ from rig.identification.conclusion import check_matrix, conclude
 from rig.journal.run_folder import Record, RunFolder, measured_postures, new_run_folder
 from rig.outputs.messages import save_result
 from rig.prove.steps import set_values
-from rig.readings.attitude import Array
-from rig.readings.geometry import geometry_of
+from rig.readings.geometry import Array, geometry_of
 
 
 def attitudes(record: Record) -> Array:

@@ -16,10 +16,8 @@ DEFAULT_ROTATES = {"pitch": "X", "yaw": "Z", "roll": "Y"}
 
 Pulses = tuple[int, ...]  # (n,) in the order of the axes
 # Keys of a translation, and where their values are kept: in the unit of the axis.
-OF_TRANSLATION = {
-    "min_mm": "min_deg", "max_mm": "max_deg", "speed_mm_s": "speed_deg_s",
-    "accel_mm_s2": "accel_deg_s2", "range_mm": "range_deg",
-}  # fmt: skip
+IN_UNIT = ("min_deg", "max_deg", "speed_deg_s", "accel_deg_s2", "range_deg")
+OF_TRANSLATION = {name.replace("_deg", "_mm"): name for name in IN_UNIT}
 
 
 class Scale(Section):
@@ -119,8 +117,7 @@ class Axis(Scale):
 
     def key_of(self, name: str) -> str:
         """The key of rig.toml that holds a value, such as ``min_deg`` or ``min_mm``."""
-        pairs = OF_TRANSLATION.items() if self.kind == "translation" else ()
-        return next((new for new, old in pairs if old == name), name)
+        return name.replace("_deg", "_mm") if self.kind == "translation" else name
 
     @classmethod
     def unmoved(cls, name: str, unit: int, drive_map: DriveMap) -> "Axis":

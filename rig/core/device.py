@@ -22,8 +22,7 @@ from rig.faults import LimitError, MotionFault, PauseRequested, Requests
 from rig.journal.device import SIGN_CHECKED, DeviceRecord
 from rig.journal.run_folder import Record, RunFolder
 from rig.readings import make_source
-from rig.readings.attitude import Array, Reading
-from rig.readings.geometry import Frame, geometry_of
+from rig.readings.geometry import Array, Frame, Reading, geometry_of
 from rig.readings.source import ReadingError
 
 LOOK_S = 0.002  # between two looks for a reading
@@ -40,6 +39,10 @@ class Posture(NamedTuple):
 
     name: str
     pulses: Pulses
+
+
+class Reached(Exception):
+    """What is looked for ``meanwhile``, in a move, has come: it goes no further."""
 
 
 def approach(config: RigConfig, target: Pulses) -> list[Pulses]:
@@ -106,7 +109,9 @@ class Device:
         self.stopper = Stopper(self.drives, run.emit)
         turns = Turns.of(self.record)
         checked = not self.record.missing(config, SIGN_CHECKED)
-        gains = turns.gains if turns and checked else None
+        sure = turns if checked else None
+        # Degrees of the phone for a commanded one of each axis.
+        gains = sure and np.linalg.norm(sure.deg, axis=0).tolist()
         self.proof = Proof(config.axes, self.geometry, checked, run.simulated, gains)
         self.proof.stops = stop_distances(self.record, config.axes)
         self.shown = False  # each axis has turned the phone as `axes` saw it

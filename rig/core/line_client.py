@@ -21,7 +21,7 @@ from rig.drives import Drive, Line, make_drives
 from rig.drives.drive import Status
 from rig.drives.line import BusError
 from rig.faults import LimitError, Refused
-from rig.journal.lock import BusLock
+from rig.journal.lock import HELD, BusLock
 
 NORMAL_S = 30.0  # for a reply, or word of it; a board that was reset takes seconds
 URGENT_S = 1.0  # for one of a stop, besides an exchange that is under way
@@ -31,8 +31,8 @@ LATE = "does not answer"
 # Errors that a line raises of its own accord, by the names that cross the pipe.
 KINDS = {kind.__name__: kind for kind in (LimitError, ValueError)}
 OF_MAP = (  # what a drive knows by its map alone
-    "can_reset", "can_home", "can_set_zero", "counts_from_home", "tells_homed",
-    "lasting", "foreign", "watch_counts",
+    "can_reset", "can_set_zero", "counts_from_home", "tells_homed", "lasting",
+    "foreign", "watch_counts",
 )  # fmt: skip
 GONE = "Find out who ended it. The session stops its drives"
 
@@ -63,7 +63,7 @@ class LineClient(Line):
         pairs = [socket.socketpair() for _ in range(2)]
         far_life, self._life = os.pipe()
         os.set_blocking(self._life, False)
-        lock = BusLock(self._config.bus).held_fd
+        lock = HELD.get(BusLock(self._config.bus).path, -1)
         far = [pairs[0][1].fileno(), pairs[1][1].fileno(), far_life]
         self._process = subprocess.Popen(
             [sys.executable, "-m", "rig.core.line_process", *map(str, [*far, lock])],

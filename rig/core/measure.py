@@ -12,8 +12,7 @@ from rig.core.device import Device, Posture
 from rig.core.motion import Arrival
 from rig.drives.drive import Status
 from rig.faults import MotionFault, NotFollowing
-from rig.readings.attitude import Array, Reading
-from rig.readings.geometry import Frame
+from rig.readings.geometry import Array, Frame, Reading
 
 DISAGREEMENT_DEG = 45.0  # between IMU and command at a posture, at most
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
@@ -32,13 +31,10 @@ def zeroed(device: Device, frame: Frame, zero: Posture) -> None:
 def measure(standing: Arrival, samples: int | None = None) -> dict[str, Any]:
     """Wait until a device at a posture has settled, then average so many readings.
 
-    Returns:
-        For the journal: ``pulses`` commanded, ``feedback`` of the drives;
-        ``commanded_deg``, ``measured_deg`` and, of single readings, ``std_deg``;
-        ``samples``; ``attitude`` (3, 3), their mean; every single reading.
-
-    Raises MotionFault: it does not settle in time, or the IMU disagrees with the
-    drives. ReadingError, BusError, StopRequested: stop everything.
+    Returns, for the journal: ``pulses`` commanded, ``feedback`` of the drives;
+    ``commanded_deg``, ``measured_deg`` and, of single readings, ``std_deg``;
+    ``samples``; ``attitude`` (3, 3), their mean; every single reading. MotionFault: it
+    does not settle in time, or the IMU disagrees with the drives.
     """
     device, target = standing.device, standing.posture.pulses
     settle = device.config.settle

@@ -13,7 +13,7 @@ from rig.core.heartbeat import SLEPT_S, clock_ahead_s
 from rig.drives.drive import START_S, STILL_COUNTS, Drive, Status
 from rig.drives.line import BusError
 from rig.faults import EndedShort, MotionFault, Unreachable
-from rig.readings.attitude import Array
+from rig.readings.geometry import Array
 
 DEADLINE_FACTOR, DEADLINE_SLACK_S = 2.0, 2.0  # of a move's computed time, and more
 FOLLOWING_DEG = 3.0  # a drive may leave its way by

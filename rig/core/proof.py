@@ -25,8 +25,7 @@ from rig.config.axis import Axis, Pulses
 from rig.config.settings import ImuSettings, ReadingsSettings
 from rig.faults import MotionFault, TurnedTooFar
 from rig.journal.device import SIGN_CHECKED, STOP_PROVED, DeviceRecord
-from rig.readings.attitude import Array, matrix_to_euler
-from rig.readings.geometry import Geometry
+from rig.readings.geometry import Array, Geometry, matrix_to_euler
 from rig.readings.source import Source
 
 FIRST_MOTOR_DEG = 0.36
@@ -120,11 +119,6 @@ class Turns(NamedTuple):
         """The columns that `axes` saw; None where the record does not say."""
         told = (record.state(SIGN_CHECKED) or {}).get("turns")
         return told and cls(np.array(told["pulses"]), np.array(told["deg"]))
-
-    @property
-    def gains(self) -> list[float]:
-        """Degrees of the phone for a commanded one of each axis."""
-        return [float(size) for size in np.linalg.norm(self.deg, axis=0)]
 
     def at(self, config: RigConfig, pulses: Pulses) -> Array:
         """The columns at other pulses: a joint's axis turns with those it carries."""

@@ -18,8 +18,7 @@ from rig.drives import Drive
 from rig.drives.line import BusError
 from rig.faults import MotionFault, Refused
 from rig.journal.device import HOMED, IDENTIFIED, DeviceRecord
-from rig.readings.attitude import Array
-from rig.readings.geometry import geometry_of
+from rig.readings.geometry import Array, geometry_of
 
 TOLD_SHARE = 0.2  # of the largest: an axis that moved less is left out of the words
 

@@ -31,8 +31,7 @@ from rig.faults import (
 from rig.journal.device import SIGN_CHECKED, ZEROED
 from rig.journal.lock import BusLock
 from rig.journal.run_folder import Record
-from rig.readings.attitude import Array, angle_between_deg
-from rig.readings.geometry import Attitudes
+from rig.readings.geometry import Array, Attitudes, angle_between_deg
 from rig.readings.source import ReadingError
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone

@@ -6,12 +6,12 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rig.drives.drive import Drive
 from rig.drives.line import Line
-from rig.faults import Refused
+from rig.faults import Refused, Report, unheard
 
 if TYPE_CHECKING:
     from rig.config.axis import Axis
@@ -38,8 +38,17 @@ def kind_of(drive_map: DriveMap) -> type[Drive]:
     """The class of a map's drives; Refused where there is no such class."""
     text = KINDS.get(drive_map.drive, drive_map.drive)
     try:
-        drive_type: type[Drive] = named(text, drive_map.folder)
-        _require_drive(drive_type)
+        drive_type: Any = named(text, drive_map.folder)
+        if not isinstance(drive_type, type) or not issubclass(drive_type, Drive):
+            name = getattr(drive_type, "__name__", repr(drive_type))
+            raise TypeError(f"{name} is no subclass of rig.drives.Drive")
+        line_type: Any = getattr(drive_type, "line_type", None)
+        if not isinstance(line_type, type) or not issubclass(line_type, Line):
+            must = "line_type must be a subclass of rig.drives.Line"
+            raise TypeError(f"{drive_type.__name__}.{must}")
+        for kind in (drive_type, line_type):
+            for method in sorted(kind.__abstractmethods__):
+                raise TypeError(f"{kind.__name__} must define {method}")
     except Exception as error:  # whatever the import of foreign code raises
         raise Refused(
             f"the map {drive_map.name} names drive = {drive_map.drive!r}, which cannot "
@@ -49,24 +58,11 @@ def kind_of(drive_map: DriveMap) -> type[Drive]:
     return drive_type
 
 
-def _require_drive(drive_type: Any) -> None:
-    """TypeError where it is no class of a drive that can move and stop."""
-    name = getattr(drive_type, "__name__", repr(drive_type))
-    if not isinstance(drive_type, type) or not issubclass(drive_type, Drive):
-        raise TypeError(f"{name} is no subclass of rig.drives.Drive")
-    line_type = getattr(drive_type, "line_type", None)
-    if not isinstance(line_type, type) or not issubclass(line_type, Line):
-        raise TypeError(f"{name}.line_type must be a subclass of rig.drives.Line")
-    for kind in (drive_type, line_type):
-        for method in sorted(kind.__abstractmethods__):
-            raise TypeError(f"{kind.__name__} must define {method}")
-
-
 def make_drives(
     settings: BusSettings,
     axes: Sequence[Axis],
     silence_s: float = 0.0,
-    emit: Callable[..., Any] = lambda event, **fields: None,
+    emit: Report = unheard,
 ) -> tuple[Line, list[Drive]]:
     """The line of a device, to be opened, and the drive of each axis on it; Refused
     where they are of several kinds of line, or of none on this bus."""

@@ -132,11 +132,17 @@ class Bus(Line):
         return serial and alike and bool(maps[0].broadcast_stop)
 
     def stop_at_once(self, drives: Sequence[Drive]) -> None:
-        if self.stops_at_once(drives):
-            family: Any = drives[0].axis.map
-            for frame in family.stop.write:
-                words = frame.registers(family.word_order)
-                self.broadcast(frame.address, frame.function, words)
+        """Write the stop to every unit of a serial line; none answers."""
+        if not self.stops_at_once(drives):
+            return
+        family: Any = drives[0].axis.map
+        for frame in family.stop.write:
+            words = frame.registers(family.word_order)
+            self.tell(0, address=frame.address, words=words)
+            request = written(frame.function, frame.address, words)
+            with self._lock:
+                self._send(frame.function, 0, request, answered=False)
+                self._quiet_until += TURNAROUND_S
 
     def read(
         self,
@@ -193,15 +199,11 @@ class Bus(Line):
         self.tell(unit, address=address, words=words)
         if not self._urgent:  # an acknowledgement of a stop tells of a stop, also late
             self._catch_up(unit, self._readable.get(unit))
-        data = struct.pack(f">{len(words)}H", *words)
-        head = struct.pack(">H", address)
-        if function == 16:
-            head += struct.pack(">H", len(words))
-            data = bytes([len(data)]) + data
+        request = written(function, address, words)
         unsure = function != 16 and self._client.echo is None
-        reply = self._exchange(function, unit, head + data, address, owed=0)
+        reply = self._exchange(function, unit, request, address, owed=0)
         (self._doubted.add if unsure else self._doubted.discard)(unit)
-        if reply != (head if function == 16 else head + data):
+        if reply != request[:4]:  # address and value, or their number
             self._resynchronise(unit, function, 0)
             raise BusError(f"unit {unit}: the reply to a write is not its echo")
 
@@ -253,16 +255,6 @@ class Bus(Line):
         if self._owed.get(unit):
             why = f"unit {unit}: its replies are too late to be assigned"
             raise BusError(why, LATER)
-
-    def broadcast(self, address: int, function: int, words: list[int]) -> None:
-        """Write registers of every unit on a serial line; no unit answers."""
-        self.tell(0, address=address, words=words)
-        data = struct.pack(f">{len(words)}H", *words)
-        more = struct.pack(">HB", len(words), len(data)) if function == 16 else b""
-        with self._lock:
-            request = struct.pack(">H", address) + more + data
-            self._send(function, 0, request, answered=False)
-            self._quiet_until += TURNAROUND_S
 
     def _exchange(
         self, function: int, unit: int, request: bytes, address: int, owed: int
@@ -323,7 +315,7 @@ class Bus(Line):
         stop asks for a second where a gateway may be busy over the first."""
         if self._spare is not None and self._spare is self._wire_of.get(unit):
             self._client, self._spare = self._spare, self._client
-        elif self._urgent and not (self._spare or self._alone) and self._client.owes:
+        elif self._urgent and not (self._spare or self._alone) and self._client.owes():
             self._alone = True
             second = Wire(self.settings)
             with contextlib.suppress(Exception):  # it gives none
@@ -363,6 +355,13 @@ def _why_closed(settings: BusSettings, error: Exception) -> tuple[str, str]:
 
 def data_size(function: int, quantity: int) -> int:
     return 2 * quantity if function in REGISTERS else (quantity + 7) // 8
+
+
+def written(function: int, address: int, words: list[int]) -> bytes:
+    """The data of a request to write registers, or a coil."""
+    data = struct.pack(f">{len(words)}H", *words)
+    more = struct.pack(">HB", len(words), len(data)) if function == 16 else b""
+    return struct.pack(">H", address) + more + data
 
 
 def words_of(data: bytes) -> list[int]:

@@ -46,7 +46,7 @@ class Status(Look):
 
 class Drive(abc.ABC):
     line_type: ClassVar[type[Line]]
-    can_reset = can_home = can_set_zero = False
+    can_reset = can_set_zero = False
     counts_from_home = False  # its origin is told from its count: HOME or 0
     tells_homed = says_homed = False  # whether it can say so, and as last read
 
@@ -119,7 +119,7 @@ class Drive(abc.ABC):
         return None
 
     def home(self) -> None:
-        """Start its own homing, where ``can_home``."""
+        """Start its own homing, where its map has one."""
 
     def set_zero(self, count: int) -> None:
         """Count from ``count`` where it stands, where ``can_set_zero``."""

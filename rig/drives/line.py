@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from rig.faults import Fault
+from rig.faults import Fault, Report, unheard
 
 if TYPE_CHECKING:
     from rig.config.settings import BusSettings
@@ -51,10 +51,7 @@ class Line(abc.ABC):
     in_turn: bool = False  # its drives move one after another
 
     def __init__(
-        self,
-        settings: BusSettings,
-        silence_s: float = 0.0,
-        emit: Callable[..., Any] = lambda event, **fields: None,
+        self, settings: BusSettings, silence_s: float = 0.0, emit: Report = unheard
     ) -> None:
         """``silence_s`` between frames; ``emit`` is told of every write."""
         self.settings = settings

@@ -25,8 +25,8 @@ class ModbusDrive(Drive):
 
     def __init__(self, line: Bus, axis: Axis) -> None:
         has = {name for name, table in vars(axis.map).items() if table is not None}
-        self.can_reset, self.can_home = "alarm_reset" in has, "home" in has
-        self.can_set_zero, self.tells_homed = "set_zero" in has, "homed" in has
+        self.can_reset, self.can_set_zero = "alarm_reset" in has, "set_zero" in has
+        self.tells_homed = "homed" in has
         self.counts_from_home = axis.map.home_place is not None  # type: ignore[attr-defined]  # of Modbus
         super().__init__(line, axis)
 
@@ -58,7 +58,7 @@ class ModbusDrive(Drive):
 
     def foreign(self, ids: dict[str, int | str]) -> str:
         for name, (low, high) in self.map.recognise.items():
-            value = ids[name]
+            value = ids.get(name)
             if isinstance(value, int) and not low <= value <= high:
                 return f"{name} is {value}, not in [{low}, {high}]"
         return ""
@@ -152,15 +152,15 @@ class ModbusDrive(Drive):
         tries = 1 if once else 1 + self.line.settings.read_retries
         for tries_left in reversed(range(tries)):
             try:
-                return self._write(table, values)
+                for frame in table.write if table else ():
+                    words = frame.registers(self.map.word_order, **values)
+                    self.line.write(
+                        self.axis.unit, frame.address, frame.function, words
+                    )
+                return
             except BusError as error:
                 if not tries_left or error.refused:
                     raise
-
-    def _write(self, table: Frames | None, values: dict[str, float]) -> None:
-        for frame in table.write if table else ():
-            words = frame.registers(self.map.word_order, **values)
-            self.line.write(self.axis.unit, frame.address, frame.function, words)
 
     def read(self, read: Value, retries: int | None = None) -> int:
         """A value of the map as a whole number, a position in counts."""

@@ -13,7 +13,7 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container
 from typing import TYPE_CHECKING, Any
 
 from rig.drives.line import BusError
@@ -203,14 +203,10 @@ class Wire:
         self.noise = came[:HEX_BYTES].hex(" ") + more
         return f"the bytes received are not a reply: {self.noise}"
 
-    @property
-    def owes(self) -> bool:
-        """Whether a gateway may be busy with requests of before."""
-        return self._owes(self._unanswered)
-
-    def _owes(self, numbers: Iterable[int]) -> bool:
+    def owes(self, numbers: Container[int] = range(1 << 16)) -> bool:
+        """Whether a gateway may be busy with requests of before, of these numbers."""
         recent = time.monotonic() - OWED_S
-        return any(self._unanswered.get(number, 0.0) > recent for number in numbers)
+        return any(s > recent and n in numbers for n, s in self._unanswered.items())
 
     def ask_only(self, request: bytes) -> None:
         """Take no reply to another, and none that came before."""
@@ -228,7 +224,7 @@ class Wire:
         if request[1] in WRITES and request not in self._accepted:
             self._forget(lambda other: other[0] == request[0])  # it was before
         accepted = self._accepted.setdefault(request, set())
-        often = len(accepted) >= MOST_UNANSWERED and self._owes(accepted)
+        often = len(accepted) >= MOST_UNANSWERED and self.owes(accepted)
         if often or request in self._kept:
             return b""
         self._number = self._number + 1 & 0xFFFF

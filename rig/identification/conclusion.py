@@ -15,8 +15,7 @@ from rig.faults import MotionFault
 from rig.journal.run_folder import Record, measured_postures
 from rig.outputs.messages import recalibrate
 from rig.parts import model_of
-from rig.readings.attitude import Array
-from rig.readings.geometry import Geometry, geometry_of
+from rig.readings.geometry import Array, Geometry, geometry_of
 
 USUAL = (1 / 3, 3.0)  # degrees of a joint for one commanded; outside it is told
 SIGNIFICANT = 3.0  # standard deviations, of a drift
@@ -74,10 +73,8 @@ def uncertainty(
     """noise_std_deg (m,) of a recorded mean, dof of an axis, basis, ci95 (m, n + 1):
     95 % half-widths of [A | b] that hold all of these at once (Bonferroni).
 
-    The noise is that of a fit of all postures, those held out too: it holds play, slow
-    noise and drift, and the parameters' errors, which makes Student's t a little wide.
-    Without held-out postures only the scatter of single readings is known, which is too
-    optimistic where they are correlated; ``basis`` says which it was.
+    The noise is that of a fit of all postures, which holds play, slow noise and drift;
+    without held-out ones the scatter of single readings, too small where correlated.
     """
     everything, count = [*chosen, *held_out], len(chosen[0]["commanded_deg"]) + 1
     basis, dof = f"the fit of all {len(everything)} postures", len(everything) - count
@@ -135,15 +132,9 @@ def estimate_drift(
 ) -> dict[str, Any] | None:
     """How far the phone's zero drifted; None where it was visited once.
 
-    The zero posture is visited first, in the middle and last. A heading that drifts
-    turns the phone's world, so a linear drift is taken out of the attitudes, never of
-    angles: ``R' = exp(-w t) R`` with w (3,) in that world. Three visits tell a linear
-    drift from any other, which cannot be taken out.
-
-    Returns:
-        Of the ``visits``: minutes (V,) and angles_deg (V, m); size_deg, the largest;
-        turn_deg_per_min (3,), w; corrected: it is linear and to be taken out; left_deg,
-        what is in the measurements then; limit_deg, and whether left is over it.
+    A heading that drifts turns the phone's world: a linear drift is taken out of the
+    attitudes, ``R' = exp(-w t) R`` with w (3,) in that world (turn_deg_per_min), once
+    three visits have told it from any other (corrected). left_deg: what remains.
     """
     zero = visits[0]
     if len(visits) < 2:

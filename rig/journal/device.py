@@ -1,10 +1,7 @@
 """device.json: what was proved of a device, what has voided it, where it was left.
 
-A device is trusted in steps: IDENTIFIED (these drives answer at these units), HOMED
-(the pulses mean a place), SIGN_CHECKED (each axis turns the joint it is named after,
-the way and about as far as it is told), STOP_PROVED (every way to stop was tried in a
-slow move), ZEROED (the zero posture's attitude is known). No step stands without those
-before it. A session needs all but the last, which it reaches itself.
+A device is trusted in steps, STATES, that docs/rig.md explains; none stands without
+those before it. A session needs all but the last, which it reaches itself.
 """
 
 from __future__ import annotations

@@ -71,11 +71,6 @@ class BusLock:
         HELD[self.path] = fd
         return self.adopt(fd, what)
 
-    @property
-    def held_fd(self) -> int:
-        """The file of the lock, where this process holds it; -1 where it does not."""
-        return HELD.get(self.path, -1)
-
     def adopt(self, fd: int, what: str) -> BusLock:
         """Go on holding what another process held, of which this one has the file."""
         if fd >= 0:

@@ -25,7 +25,7 @@ from rig.procedures.plan import (
     plan_lines,
     travel_order,
 )
-from rig.readings.attitude import Array
+from rig.readings.geometry import Array
 
 MIDDLE, END = "reference:middle", "reference:end"  # visits of the zero posture
 
@@ -182,11 +182,9 @@ def collect(run: Run, count: int) -> int:
     """Record ``count`` random postures, the paper's Datasets 4 and 5: pairs.csv, and in
     dataset.npz whole episodes, ``candidates`` and ``measured`` (episodes, M, ...)."""
     config = run.config
-
-    def make() -> dict[str, Any]:
-        return {"pulses": draw(config, count, 2).tolist()}
-
-    drawn = run.remember("collection", make)["pulses"]
+    drawn = run.remember(
+        "collection", lambda: {"pulses": draw(config, count, 2).tolist()}
+    )["pulses"]
     targets = {f"collect:{number}": pulses for number, pulses in enumerate(drawn)}
     if run.lacks([*targets, END]):
         with run.device() as device:

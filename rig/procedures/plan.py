@@ -15,7 +15,7 @@ from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.outputs.messages import choice_text, numbers
 from rig.parts import model_of
-from rig.readings.attitude import Array
+from rig.readings.geometry import Array
 
 EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
 REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed
@@ -67,15 +67,14 @@ def choose(
     def select(method: str) -> Any:
         import jaxcal
 
-        # Greedy draws nothing.
-        more: dict[str, Any] = (
-            {"seed": config.session.seed} if method != "greedy" else {}
-        )
+        options = given | {"method": method}
+        if method != "greedy":  # which draws nothing
+            options["seed"] = config.session.seed
         if method in ("auto", "exact"):
-            more["time_limit"] = limit_s
+            options["time_limit"] = limit_s
         if method == "auto":
-            more["least_efficiency"] = config.session.min_efficiency
-        return jaxcal.select(candidates_deg, config.k, method=method, **given, **more)
+            options["least_efficiency"] = config.session.min_efficiency
+        return jaxcal.select(candidates_deg, config.k, **options)
 
     if made is not None:  # what predicts best what any candidate measures
         chosen = best = select(config.session.method or "auto")

@@ -20,8 +20,7 @@ from rig.outputs.messages import error_text, held_out
 from rig.parts import model_of
 from rig.procedures.calibrate import pair_targets, visit_pairs
 from rig.procedures.plan import draw_held_out
-from rig.readings.attitude import Array
-from rig.readings.geometry import Frame, geometry_of
+from rig.readings.geometry import Array, Frame, geometry_of
 
 
 def load_calibration(

@@ -25,8 +25,7 @@ from rig.core.measure import measure
 from rig.core.motion import move
 from rig.core.proof import RADIANS
 from rig.faults import MotionFault
-from rig.readings.attitude import Array, euler_to_matrix, matrix_to_euler
-from rig.readings.geometry import geometry_of
+from rig.readings.geometry import Array, geometry_of, matrix_to_euler, mounting_of
 
 CLEAR = 4.0  # standard deviations that make a difference a finding
 NEAREST = 0.7  # cosine: an axis within 45 degrees of where it is expected
@@ -231,7 +230,7 @@ def _placed(config: RigConfig, rates: Array, expected: Array) -> Findings:
     """What each drive turns, and the mounting that fits them best."""
     size = np.linalg.norm(rates, axis=0)
     axes = rates / size
-    told = euler_to_matrix(config.phone.mounting_deg, "ZYX")
+    told = mounting_of(config)
     cosines = expected.T @ told @ axes  # rows: joints
     joints: tuple[int, ...] = max(
         itertools.permutations(range(len(cosines))),  # the first is as named
@@ -249,13 +248,7 @@ def _placed(config: RigConfig, rates: Array, expected: Array) -> Findings:
             f"joint's axis, so imu.mounting_deg is wrong. Correct it roughly, {AGAIN}"
         )
     goal, turned = expected[:, joints] * signs, told @ axes
-    if len(joints) == 1:  # the least turn that fits it
-        across = np.cross(turned[:, 0], goal[:, 0])
-        sine = np.linalg.norm(across)
-        angle = np.arctan2(sine, turned[:, 0] @ goal[:, 0])
-        correction = Rotation.from_rotvec(across * (angle / max(sine, 1e-12)))
-    else:
-        correction, _ = Rotation.align_vectors(goal.T, turned.T)
+    correction, _ = Rotation.align_vectors(goal.T, turned.T)  # of one the least turn
     mounting = correction.as_matrix() @ told
     turned_deg = float(np.linalg.norm(turn(told, mounting)))
     return Findings(joints, signs * size, mounting, turned_deg, None)

@@ -12,7 +12,7 @@ from rig.drives.drive import HOME, Drive
 from rig.drives.line import BusError
 from rig.faults import MotionFault, Refused
 from rig.journal.device import HOMED
-from rig.readings.attitude import Array, Reading
+from rig.readings.geometry import Array, Reading
 
 NO_LIMIT_DEG = 1e9
 HOME_S = 120.0  # for one axis on its own way home

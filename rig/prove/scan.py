@@ -139,15 +139,13 @@ def _ask(bus: Bus, unit: int, families: list[RegisterMap]) -> Answer | None:
                 return None
             continue
         there = True
-        identity: dict[str, int] = {}
-        with contextlib.suppress(BusError):  # registers that a model lacks are left out
-            told = drive.ids().items()
-            identity = {name: value for name, value in told if isinstance(value, int)}
-        ranges = family.recognise.items()
-        proofs = [(identity[n], *span) for n, span in ranges if n in identity]
-        if all(low <= value <= high for value, low, high in proofs):
-            # Registers that are not there read as 0 in some drives.
-            proved = sum(value != 0 for value, *_ in proofs)
+        told: dict[str, int | str] = {}
+        with contextlib.suppress(BusError):
+            told = drive.ids()
+        if not drive.foreign(told):
+            # Registers that a model lacks are left out; in some drives they read as 0.
+            identity = {name: n for name, n in told.items() if isinstance(n, int)}
+            proved = sum(identity.get(name, 0) != 0 for name in family.recognise)
             fitting.append(((proved, len(identity)), drive, identity))
     if not fitting:
         return Answer(unit, (), {}) if there else None

@@ -18,7 +18,7 @@ from rig.command_run import Run, listen, run_safely
 from rig.config import ConfigError, RigConfig, parse_config
 from rig.config.schema import read_text
 from rig.core import session
-from rig.core.device import Check, Device, Posture
+from rig.core.device import Check, Device, Posture, Reached
 from rig.core.motion import move
 from rig.core.proof import ALLOWED_DEG, slowed
 from rig.core.record_check import check_drives
@@ -89,10 +89,6 @@ class Operator:
             self.say(f"confirmed by --yes: {word}")
         elif self._answer(f"Type {word} to continue: ") != word:
             raise Refused(f"not confirmed ({word!r} was not typed); nothing was done")
-
-
-class TurnReached(Exception):
-    """The phone has turned as far as the whole step was to turn it."""
 
 
 @dataclasses.dataclass
@@ -228,12 +224,12 @@ def jog(site: Site, name: str, way_deg: float) -> int:
         def look() -> None:
             turned = device.geometry.apart(base, device.imu.latest().value)
             if turned > device.geometry.scale * abs(way_deg) and not checked:
-                raise TurnReached(f"{turned:.1f}")
+                raise Reached(f"{turned:.1f}")
 
         device.meanwhile = look
         try:
             move(device, Posture("jog", tuple(here)))
-        except TurnReached as turned:
+        except Reached as turned:
             device.stopper.stop("moved far enough, as measured", latch=False)
             gone = abs(moved.to_deg(device.positions()[axis] - start))
             run.say(

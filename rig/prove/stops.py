@@ -1,10 +1,7 @@
 """Every way that the software has to stop the drives, tried in a slow move.
 
-The axes move together (one by one where their line moves them in turn), 3 degrees or
-mm either side, less of more than three, and are stopped on the way: by the frame to
-each unit, the broadcast and the drives' own watch of the line. Each must stand short of
-its target, by drive and phone, and stay there. How far they went on, there and in a
-faster move, says how fast an axis may be near a limit.
+The axes move together, or one by one where their line moves them in turn. How far they
+went on, there and in a faster move, says how fast an axis may be near a limit.
 """
 
 from __future__ import annotations
@@ -20,7 +17,7 @@ from typing import Any, NamedTuple
 from rig.command_run import Run
 from rig.config.axis import Pulses
 from rig.core import stop
-from rig.core.device import Device, Posture
+from rig.core.device import Device, Posture, Reached
 from rig.core.motion import move
 from rig.core.proof import FASTER, StopDistance, stop_distances
 from rig.drives import Drive
@@ -45,10 +42,6 @@ BY_UNITS = "the stop of each unit"
 Times = list[tuple[float, float]]
 Act = Callable[[Device], Times]
 Ends = tuple[Pulses, Pulses]  # of a move
-
-
-class _ShareReached(Exception):
-    """All axes have gone a share of their way."""
 
 
 class StopTrial(NamedTuple):
@@ -263,11 +256,11 @@ def _go(device: Device, ends: Ends) -> list[int]:
     def look() -> None:
         places = [_last(drive).position for drive in device.drives]
         if min(_shares(ends, places)) >= BEGIN:
-            raise _ShareReached
+            raise Reached
 
     device.meanwhile = look
     try:
-        with contextlib.suppress(_ShareReached):
+        with contextlib.suppress(Reached):
             move(device, Posture("try the stop", ends[1]))
     finally:
         device.meanwhile = lambda: None

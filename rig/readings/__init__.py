@@ -3,16 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from rig.config import RigConfig
+from rig.faults import Report, unheard
 from rig.parts import part
 from rig.readings.source import Source
 
 
-def make_source(
-    config: RigConfig, report: Callable[..., object] = lambda event, **fields: None
-) -> Source:
+def make_source(config: RigConfig, report: Report = unheard) -> Source:
     """What a device is measured with; to be opened. ``report`` gets its events."""
     if config.readings is not None:
         source: Source = part("numbers", "[readings]")(config.readings, report)

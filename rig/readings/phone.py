@@ -10,13 +10,13 @@ import re
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from rig.config.settings import ImuSettings
-from rig.readings.attitude import Array, Reading
+from rig.faults import Report, unheard
+from rig.readings.geometry import Array, Reading
 from rig.readings.source import BACKLOG, Receiver
 from rig.readings.stream import MAX_BODY, LineSplitter, StreamParser
 
@@ -42,21 +42,15 @@ class Connection:
 class Imu(Receiver):
     """The attitude of the phone, (3, 3) to its world: of one, whoever else connects.
 
-    Who may not be heard is refused unread. At most MOST_OPEN connections are open, none
-    for longer than PATIENCE_S without a word. Messages are pushed over any connection
-    of one address. Lines come over one: a phone that lost its Wi-Fi comes back on
-    another, which takes its place once no reading of the old was of use for
-    ``stale_s``; until then it is refused.
+    Messages are pushed over any connection of one address. Lines come over one: a phone
+    that lost its Wi-Fi comes back on another, which takes its place once no reading of
+    the old was of use for ``stale_s``; until then it is refused.
     """
 
     whose, table = "the phone", "imu"
     start, lost = "start its app", "Check its Wi-Fi, and that its app is in front"
 
-    def __init__(
-        self,
-        settings: ImuSettings,
-        report: Callable[..., object] = lambda event, **fields: None,
-    ) -> None:
+    def __init__(self, settings: ImuSettings, report: Report = unheard) -> None:
         super().__init__(settings, report)
         self.settings: ImuSettings = settings
         self.world = np.eye(3)

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from rig.faults import Fault
-from rig.readings.attitude import Array, Reading
+from rig.faults import Fault, Report, unheard
+from rig.readings.geometry import Array, Reading
 
 RING = 8192  # readings kept: over half a minute at 200 Hz
 REJOIN = 5  # readings in a row that agree with each other after a jump
@@ -61,11 +61,7 @@ class Source(abc.ABC):
     connections = 0  # a heading may be another one after a new connection
     world: Array = np.eye(3)  # by which attitudes are turned
 
-    def __init__(
-        self,
-        stale_s: float,
-        report: Callable[..., object] = lambda event, **fields: None,
-    ) -> None:
+    def __init__(self, stale_s: float, report: Report = unheard) -> None:
         """``report`` gets an event and its fields, on the receiving thread."""
         self.stale_s = stale_s
         self.report = report
@@ -189,11 +185,7 @@ class Source(abc.ABC):
 class Receiver(Source):
     """A source that is called or calls at ``host`` and ``port`` of its settings."""
 
-    def __init__(
-        self,
-        settings: Any,
-        report: Callable[..., object] = lambda event, **fields: None,
-    ) -> None:
+    def __init__(self, settings: Any, report: Report = unheard) -> None:
         super().__init__(settings.stale_s, report)
         self.settings = settings
         self._port = settings.port

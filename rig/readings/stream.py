@@ -18,7 +18,7 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from rig.config.settings import ImuSettings
-from rig.readings.attitude import Array, Reading, angle_between_deg, euler_to_matrix
+from rig.readings.geometry import Array, Reading, angle_between_deg, euler_to_matrix
 from rig.readings.source import JumpGate
 
 MAX_LINE = 8192  # bytes; SensorLog's header has under 3000, other lines under 1000

@@ -22,7 +22,7 @@ from rig.faults import MotionFault, Refused
 from rig.prove.axis_check import Stand, stand_at
 from rig.prove.axis_moves import ROOM_DEG, SEEN_DEG
 from rig.prove.steps import Site, number_of
-from rig.readings.attitude import Array
+from rig.readings.geometry import Array
 
 LEVEL = 0.95
 PAIRS = 8  # of readings, of the play and of the dead zone

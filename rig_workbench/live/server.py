@@ -19,9 +19,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rig.faults import Fault, Refused
+from rig.faults import PAUSE, Fault, Refused
 from rig.pages import HOST
-from rig.signals import PAUSE
 from rig_workbench.live.page import make_page
 from rig_workbench.live.watcher import Watcher
 

@@ -14,12 +14,11 @@ from collections import deque
 from typing import Any
 
 from rig.core.stop import UnitStop
-from rig.faults import Fault, Refused
+from rig.faults import PAUSE, Fault, Refused
 from rig.journal.lock import armed_files, read_armed
 from rig.journal.run_folder import JOURNAL, Record, is_written
 from rig.outputs.run_state import RunState
 from rig.outputs.telemetry import PERIOD_S, TELEMETRY
-from rig.signals import PAUSE
 from rig.stopping import NOTHING, armed_bus, stop_units
 from rig_workbench.live.charts import SHOWN_S
 

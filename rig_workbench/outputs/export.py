@@ -23,7 +23,7 @@ from rig.config.config import names_of, units_of
 from rig.faults import Refused
 from rig.journal.run_folder import Record
 from rig.outputs.messages import recalibrate
-from rig.readings.attitude import Array
+from rig.readings.geometry import Array
 
 NUMBERS = ("matrix", "offset_deg", "min_deg", "max_deg", "pulses_per_deg", "min_pulses",
            "max_pulses")  # fmt: skip

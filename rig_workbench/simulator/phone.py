@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.config.settings import ImuSettings, ReadingsSettings
-from rig.readings.attitude import Array, euler_to_matrix, matrix_to_euler
+from rig.readings.geometry import Array, euler_to_matrix, matrix_to_euler
 from rig_workbench.simulator.faults import FaultInjector
 
 AGAIN_S = 0.05  # before it connects again

@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from rig.config.config import RigConfig
-from rig.readings.attitude import Array, euler_to_matrix
+from rig.readings.geometry import Array, euler_to_matrix
 from rig_workbench.model import model_of
 from rig_workbench.simulator.drive import SimDrive
 from rig_workbench.simulator.faults import FaultInjector

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rig.config.config import RigConfig
-from rig.readings.attitude import Array
+from rig.readings.geometry import Array
 from rig_workbench.simulator.drive import SimDrive
 from rig_workbench.simulator.faults import FaultInjector, FaultSpec
 from rig_workbench.simulator.phone import Phone, SimSensor

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rig.config import RigConfig
-from rig.readings.attitude import Array
+from rig.readings.geometry import Array
 from rig_workbench.model import model_of
 
 

@@ -28,6 +28,7 @@ from rig.core import device, motion, stop
 from rig.core.line_client import line_of
 from rig.drives import make_drives
 from rig.drives.bus import words_of
+from rig.faults import Signals
 from rig.journal.device import (
     HOMED,
     IDENTIFIED,
@@ -39,7 +40,6 @@ from rig.journal.lock import BusLock
 from rig.journal.run_folder import JOURNAL, read_journal
 from rig.outputs import messages
 from rig.procedures.calibrate import calibrate
-from rig.signals import Signals
 from rig_workbench import simulator as simulators
 from rig_workbench.outputs import report
 from rig_workbench.simulator import Truth

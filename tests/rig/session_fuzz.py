@@ -41,10 +41,9 @@ from rig.core import heartbeat, motion, stop
 from rig.core.session import visit
 from rig.drives import bus, make_drives
 from rig.drives.wire import Wire, crc16
-from rig.faults import EXIT_OK, Fault
+from rig.faults import EXIT_OK, Fault, Signals
 from rig.journal import run_folder
 from rig.readings import phone as phones
-from rig.signals import Signals
 from rig_workbench.simulator import Truth
 from rig_workbench.simulator.drive import SimDrive
 from rig_workbench.simulator.faults import FaultInjector, FaultSpec

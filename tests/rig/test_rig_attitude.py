@@ -8,13 +8,13 @@ from harness import fast_config
 from scipy.spatial.transform import Rotation
 
 from rig.config.settings import Order
-from rig.readings.attitude import (
+from rig.readings.geometry import (
     AttitudeFrame,
+    Attitudes,
     angle_between_deg,
     euler_to_matrix,
     matrix_to_euler,
 )
-from rig.readings.geometry import Attitudes
 
 ORDERS = get_args(Order)
 

@@ -22,7 +22,7 @@ from rig.prove.axis_check import (
     proposals,
 )  # fmt: skip
 from rig.prove.axis_moves import _Tour
-from rig.readings.attitude import angle_between_deg, euler_to_matrix
+from rig.readings.geometry import angle_between_deg, euler_to_matrix
 
 CONFIG = fast_config()
 GAINS = (0.43, 0.71, 0.87)  # of the paper's device

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
 from rig.config import load_config
-from rig.readings.attitude import angle_between_deg, euler_to_matrix
+from rig.readings.geometry import angle_between_deg, euler_to_matrix
 
 MATRIX = np.array([[0.95, 0.03, -0.02], [0.01, 1.04, 0.02], [-0.015, 0.01, 0.9]])
 PULSES_PER_DEG = 1000

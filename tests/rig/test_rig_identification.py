@@ -16,12 +16,12 @@ from rig.config import AXIS_NAMES
 from rig.config.settings import Order
 from rig.identification.conclusion import estimate_drift, uncertainty, without_drift
 from rig.outputs.messages import drift_text, recalibrate
-from rig.readings.attitude import (
+from rig.readings.geometry import (
     AttitudeFrame,
+    Attitudes,
     Reading,
     euler_to_matrix,
 )
-from rig.readings.geometry import Attitudes
 from rig_workbench.refit import attitudes
 from rig_workbench.simulator import Truth
 

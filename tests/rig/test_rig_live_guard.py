@@ -14,9 +14,8 @@ import urllib.request
 import pytest
 
 from rig import pages
-from rig.faults import Refused
+from rig.faults import PAUSE, Refused
 from rig.journal.run_folder import SCHEMA, Journal
-from rig.signals import PAUSE
 from rig_workbench.live.watcher import Watcher
 from rig_workbench.outputs import view
 
@@ -136,7 +135,7 @@ def test_buttons_reach_the_process_that_holds_the_journal_and_no_other(tmp_path)
 MOVES = """
 import time
 from rig.faults import StopRequested
-from rig.signals import Signals
+from rig.faults import Signals
 with Signals() as signals:
     signals.armed = True
     print("armed", flush=True)

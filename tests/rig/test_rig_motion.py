@@ -32,14 +32,13 @@ from rig.faults import (
     LimitError,
     MotionFault,
     PauseRequested,
+    Signals,
     StopRequested,
     Unreachable,
 )
 from rig.prove.home import unlimited
-from rig.readings.attitude import Reading, euler_to_matrix
-from rig.readings.geometry import geometry_of
+from rig.readings.geometry import Reading, euler_to_matrix, geometry_of
 from rig.readings.source import ReadingError
-from rig.signals import Signals
 from rig_workbench.simulator import Truth, parse_fault
 
 

@@ -29,12 +29,11 @@ from rig.core.stop import UnitStop, stop_all
 from rig.drives.bus import Bus
 from rig.drives.line import BusError
 from rig.drives.modbus import ModbusDrive
-from rig.faults import StopRequested
+from rig.faults import Signals, StopRequested
 from rig.journal import lock
 from rig.journal.lock import BusLock, read_armed
 from rig.outputs.messages import event_lines
 from rig.procedures.calibrate import collect
-from rig.signals import Signals
 from rig_workbench.simulator import parse_fault
 
 GENERIC = {'map = "leadshine_pr"': 'map = "generic"', **HASTY}
@@ -366,7 +365,7 @@ def test_a_signal_is_heard_while_the_main_thread_hangs():
     """Python runs its handlers there; a second thread hears what they cannot."""
     code = (
         "import os, signal, time\n"
-        "from rig.signals import Signals\n"
+        "from rig.faults import Signals\n"
         "with Signals() as signals:\n"
         "    signals.armed = True\n"
         "    signal.signal(signal.SIGTERM, lambda *_: None)  # as one that never runs\n"

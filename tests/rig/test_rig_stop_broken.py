@@ -403,7 +403,7 @@ MAY = {  # all of rig and jaxcal that a stop over a network may load
     "rig.__main__", "rig.core", "rig.core.stop", "rig.drives", "rig.drives.drive",
     "rig.drives.line", "rig.drives.bus", "rig.drives.modbus", "rig.drives.wire",
     "rig.faults", "rig.journal",
-    "rig.journal.lock", "rig.registers", "rig.signals", "rig.stop_config",
+    "rig.journal.lock", "rig.registers", "rig.stop_config",
     "rig.stopping",
 }  # fmt: skip
 

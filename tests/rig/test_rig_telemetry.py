@@ -12,7 +12,7 @@ from harness import fast_config, session, simulator
 from rig.drives.drive import Status
 from rig.journal.run_folder import read_journal
 from rig.outputs import telemetry
-from rig.readings.attitude import Reading, euler_to_matrix, frame_at
+from rig.readings.geometry import Reading, euler_to_matrix, frame_at
 
 
 class Phone:

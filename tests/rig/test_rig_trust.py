@@ -40,8 +40,7 @@ from rig.journal.device import (
 from rig.journal.run_folder import read_journal
 from rig.procedures.calibrate import collect
 from rig.procedures.verify import load_calibration, unchecked, verify
-from rig.readings.attitude import euler_to_matrix, frame_at
-from rig.readings.geometry import geometry_of
+from rig.readings.geometry import euler_to_matrix, frame_at, geometry_of
 from rig.readings.phone import Imu
 from rig_workbench.simulator import Truth
 from rig_workbench.simulator.faults import FaultInjector
