@@ -116,7 +116,7 @@ def test_its_adapters_to_gymnasium_take_it():
 
 @pytest.mark.slow
 def test_a_training_of_rejax_learns():
-    rejax = pytest.importorskip("rejax")
+    rejax = pytest.importorskip("rejax", reason="the extra loops is not installed")
 
     class FiveValues(purerl.GymnaxWrapper):
         """What rejax 0.1.3 was written for: one flag of the end."""
