@@ -28,10 +28,6 @@ RECONNECT_S = 0.2
 LOOK_S = 0.1  # between two looks at whether to end
 
 
-def _largest_change(before: Array, now: Array) -> float:
-    return float(np.abs(now - before).max())
-
-
 class Sensor(Receiver):
     """Numbers as they come in, on one thread."""
 
@@ -43,7 +39,7 @@ class Sensor(Receiver):
         super().__init__(settings, report)
         self.settings: ReadingsSettings = settings
         self.connections = 1  # numbers are the same whoever connects again
-        self._gate = JumpGate(_largest_change, settings.most_jump)
+        self._gate = JumpGate(lambda a, b: np.abs(b - a).max(), settings.most_jump)
 
     @property
     def where(self) -> str:
@@ -130,20 +126,16 @@ class Sensor(Receiver):
 
     def _registers(self) -> None:
         """Poll the registers."""
-        with self._bus() as bus:
-            while not self._closing.wait(self.settings.period_s):
-                asked = time.monotonic()
-                places = self.settings.registers
-                values = [decoded(bus, p, p.unit, p.word_order, 1) for p in places]
-                self._accept(np.array(values, dtype=np.float64), asked)
-
-    def _bus(self) -> Bus:
         s = self.settings
         given: dict[str, Any] = {"transport": "tcp", "host": s.host, "port": s.port}
         if s.device:
             given = {"transport": "rtu", "device": s.device, "baudrate": s.baudrate}
             given |= {"parity": s.parity, "stopbits": s.stopbits}
-        return Bus(BusSettings(**given, timeout_s=max(s.stale_s / 2, 0.05)))
+        with Bus(BusSettings(**given, timeout_s=max(s.stale_s / 2, 0.05))) as bus:
+            while not self._closing.wait(s.period_s):
+                asked = time.monotonic()
+                values = [decoded(bus, p, p.unit, p.word_order, 1) for p in s.registers]
+                self._accept(np.array(values, dtype=np.float64), asked)
 
     def _hears(self, address: str) -> bool:
         """One sender is heard: the first."""

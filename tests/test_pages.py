@@ -11,11 +11,11 @@ import sys
 
 import pytest
 
+from benchmarks.paper.exhibits.page import Link
 from jaxcal.reports.page import (
     Badge,
     Code,
     Figure,
-    Link,
     Page,
     Section,
     Table,

@@ -132,20 +132,18 @@ def check(
     """
     all_commands, measured, _ = recorded(calibration.model, commands, measured)
     say_order(all_commands, measured)
-    every = _checked(calibration, all_commands, measured)
+    postures = _postures(calibration, "commands", all_commands)
+    shape, rule = (len(postures), calibration.num_outputs), ": as many rows as commands"
+    quiet = measured is all_commands
+    measured = columns_of(calibration, "measured", measured, quiet=quiet)
+    every = postures, array_of("measured", measured, *shape, rule=rule)
     rows = calibration.model.fitting.distinct(*every)
     commands, measured = (side[rows] for side in every)
     off = _deviations(calibration, commands, measured, placed_anew)
-    names, free = calibration.names, off.free
+    names, free, counts = calibration.names, off.free, off.of_level.sum(axis=1)
     signal = (off.of_level @ off.by**2).T
-    slips = (
-        free
-        & np.isin(names, calibration.model.fitting.slips)
-        & (signal.sum(axis=1) > 0.0)
-    )
-    tests = ChangeTests(
-        off.of_level.sum(axis=1), calibration, int(slips.sum()), off.least
-    )
+    slips = free & np.isin(names, calibration.model.fitting.slips) & signal.any(axis=1)
+    tests = ChangeTests(counts, calibration, int(slips.sum()), off.least)
     slopes_of_slips = np.linalg.norm(off.by[:, slips], axis=0)
     ways = off.by[:, slips] / slopes_of_slips  # (R, S) unit vectors
     along = ((off.by.T @ ways) ** 2).max(axis=1, initial=0.0)  # seen by the best
@@ -171,10 +169,12 @@ def check(
             at = np.flatnonzero(slips)[most]
             unit = calibration.model.units_for("", calibration.measured_unit)[at]
             slipped = f"{names[at]} by {slip:.2g} {unit}"
-    says = "cannot be told" if hidden.any() or not free.any() else "holds"
-    says = "does not hold" if p_value < _ALARMS else says
-    doubted = says == "does not hold" and not placed_anew
-    mispaired = of_new_readings(calibration, *every) if doubted else None
+    says, mispaired = "holds", None
+    if p_value < _ALARMS:
+        says = "does not hold"
+        mispaired = None if placed_anew else of_new_readings(calibration, *every)
+    elif hidden.any() or not free.any():
+        says = "cannot be told"
     units = ["" if unit == "length" else unit for unit in tolerances]
     return Check(
         says=says,
@@ -305,50 +305,35 @@ def _deviations(
     calibration: Fit, commands: Array, measured: Array, placed_anew: bool
 ) -> _Deviations:
     """The deviations of measurements, of which ``check`` has the arguments."""
-    noise = noise_of(calibration, "check")
+    noise, model = noise_of(calibration, "check"), calibration.model
     predicted = outputs_at(calibration, commands)
-    off = calibration.model.fitting.wrapped(measured - predicted, commands)
+    off = model.fitting.wrapped(measured - predicted, commands)
     _require_unit(calibration, predicted + off, predicted, noise)
-    slopes = np.asarray(calibration.model.jacobian(commands, calibration.parameters))
-    p, names = slopes.shape[-1], calibration.names
+    slopes = np.asarray(model.jacobian(commands, calibration.parameters))
+    p = slopes.shape[-1]
     root, least = _whitening(calibration, commands, noise)
     white, by = root @ off.ravel(), root @ slopes.reshape(-1, p)
     level = np.tile(_levels(calibration), len(commands))  # of each reading
     free, blind = calibration.free[:p] > 0.0, np.zeros(p, dtype=np.bool_)
     if placed_anew:
-        if not calibration.model.fitting.placed:
+        if not model.fitting.placed:
             raise ValueError("placed_anew needs sockets, planes, wires or a board")
-        placed = np.isin(
-            names, calibration.model.fitting.placed
-        )  # which says nothing now
+        # Of what was placed anew, and of what does only what moving it does, the
+        # readings say nothing now.
+        placed = np.isin(calibration.names, model.fitting.placed)
         white, by = without(by[:, placed], white, by)
+        if not len(white):
+            raise ValueError("measured has too few readings to locate the moved parts")
         level, free = np.zeros(len(white), dtype=np.intp), free & ~placed
-        blind = free & _taken_up(calibration, placed)
-        free &= ~blind
-    if not len(white):
-        raise ValueError("measured has too few readings to locate the moved parts")
-    return _Deviations(
-        white, by, level == np.unique(level)[:, None], free, blind, least
-    )
-
-
-def _taken_up(calibration: Fit, placed: Mask) -> Mask:
-    """(p,) parameters that do nothing but what moving the ``placed`` (p,) ones does."""
-    at = calibration.commands, calibration.parameters
-    by = np.asarray(calibration.model.jacobian(*at))
-    by = (by / np.asarray(calibration.noise_std)[:, None]).reshape(-1, by.shape[-1])
-    remainder = by - by[:, placed] @ np.linalg.lstsq(by[:, placed], by)[0]
-    return np.linalg.norm(remainder, axis=0) < _BLIND * np.linalg.norm(by, axis=0)
-
-
-def _checked(
-    calibration: Fit, commands: ArrayLike, measured: ArrayLike
-) -> tuple[Array, Array]:
-    """Commands (N, n) and readings (N, m)."""
-    postures = _postures(calibration, "commands", commands)
-    shape, rule = (len(postures), calibration.num_outputs), ": as many rows as commands"
-    given = columns_of(calibration, "measured", measured, quiet=measured is commands)
-    return postures, array_of("measured", given, *shape, rule=rule)
+        slopes = np.asarray(
+            model.jacobian(calibration.commands, calibration.parameters)
+        )
+        was = (slopes / noise[:, None]).reshape(-1, p)
+        rest = was - was[:, placed] @ np.linalg.lstsq(was[:, placed], was)[0]
+        blind = np.linalg.norm(rest, axis=0) < _BLIND * np.linalg.norm(was, axis=0)
+        free, blind = free & ~blind, free & blind
+    of_level = level == np.unique(level)[:, None]
+    return _Deviations(white, by, of_level, free, blind, least)
 
 
 def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, float]:
@@ -418,23 +403,19 @@ def _tolerances(
         return by_unit("tolerance", given, units)
     std = calibration.predict_std(where, new_measurement=True)
     std = np.where(np.isfinite(std), std, np.asarray(calibration.noise_std))
-    return {
-        quantity.unit: float(3.0 * np.sqrt((quantity.size(std) ** 2).mean()))
-        for quantity in quantities
-    }
+    return {q.unit: float(3.0 * _size(q.size(std))) for q in quantities}
 
 
 def _changes(calibration: Fit, tolerances: Mapping[str, float]) -> Array:
     """(p,) by which of each parameter the readings of one unit at the calibration's
     commands change by its tolerance; inf where the prior lets no machine drift so."""
-    at = calibration.commands, calibration.parameters
-    slopes = np.asarray(calibration.model.jacobian(*at))
+    model = calibration.model
+    slopes = np.asarray(model.jacobian(calibration.commands, calibration.parameters))
     by_parameter = slopes.transpose(0, 2, 1)  # (N, p, q)
     with np.errstate(divide="ignore"):
         changes = [
-            tolerances[quantity.unit]
-            / np.sqrt((quantity.size(by_parameter) ** 2).mean(axis=0))
-            for quantity in calibration.model.quantities(calibration.measured_unit)
+            tolerances[quantity.unit] / _size(quantity.size(by_parameter), axis=0)
+            for quantity in model.quantities(calibration.measured_unit)
             if quantity.unit in tolerances
         ]
         change = np.min(changes, axis=0)
@@ -470,10 +451,9 @@ def verification(
     if not 1 <= whole_number("k", k, 1) <= len(points):
         raise ValueError(f"k must be in [1, {len(points)}], got {k}")
     noise = noise_of(calibration, "verification")
+    slopes, covariance = linearised(calibration, points)
+    spread = slopes @ covariance @ np.matrix_transpose(slopes) + np.diag(noise**2)
     slopes = np.asarray(calibration.model.jacobian(points, calibration.parameters))
-    prediction_slopes, covariance = linearised(calibration, points)
-    turned = np.matrix_transpose(prediction_slopes)
-    spread = prediction_slopes @ covariance @ turned + np.diag(noise**2)
     white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes
     levels = _levels(calibration)
     of_level = (levels == np.unique(levels)[:, None]).astype(np.float64)

@@ -51,9 +51,9 @@ def require_fitting(model: Any, commands: Array, measured: Array) -> Model:
         shaped = model.num_inputs != commands.shape[1] or model.num_outputs > 0
     if not shaped:
         model.predict(commands, None)
-    shapes = model.num_inputs, model.num_outputs
-    for name, table, width in zip(
-        ("commands", "measured"), (commands, measured), shapes, strict=True
+    for name, table, width in (
+        ("commands", commands, model.num_inputs),
+        ("measured", measured, model.num_outputs),
     ):
         if table.shape[1] != width:
             raise ValueError(
@@ -176,9 +176,9 @@ def _distinct_weights(
     model: Model, commands: Array, measured: Array, weights: Array
 ) -> Array:
     """(N,) the weights of the measurements that count, 0 elsewhere."""
-    used = slice(None) if weights.all() else weights > 0.0
     if not weights.any():
         raise ValueError("weights must be positive for at least one measurement")
+    used = slice(None) if weights.all() else weights > 0.0
     once = model.fitting.distinct(commands[used], measured[used])
     if len(once) == len(weights):
         return weights
@@ -214,9 +214,8 @@ def _solve_with_scales(problem: FitProblem) -> tuple[FitSolution, PriorScales]:
     scales: PriorScales | None = None
     for last in (False, True):
         scales = group_scales(problem, solution, scales)
-        scaled = dataclasses.replace(
-            problem, precision=problem.precision / scales.factors**2
-        )
+        precision = problem.precision / scales.factors**2
+        scaled = dataclasses.replace(problem, precision=precision)
         solution = solve(scaled, solution, rough=not last)
     assert scales is not None
     return solution, scales
@@ -259,9 +258,8 @@ def _misfit(
     theta = np.concatenate([solution.parameters, none])
     waves = derivative(with_misfit, problem.commands, theta)[..., -count:]
     white = solution.whitened(waves * std) / solution.level[:, None]
-    gram = np.einsum(
-        "n,nrf,nrw->fw", _information_shares(solution), solution.rows, white
-    )
+    shares = _information_shares(solution)
+    gram = np.einsum("n,nrf,nrw->fw", shares, solution.rows, white)
     turned = within[:, problem.free] @ gram
     joint = np.zeros((len(theta), len(theta)))
     joint[:-count, :-count] = fields["joint_covariance"] + turned @ turned.T
@@ -359,9 +357,7 @@ def _covariance(solution: FitSolution) -> tuple[Array, Array | None]:
         return covariance, None
     root_shares = np.sqrt(_information_shares(solution))
     rows = (root_shares[:, None, None] * solution.rows).reshape(-1, len(free))
-    rows = np.concatenate(
-        [rows, problem.model.fitting.facts(solution.parameters)[1][:, free]]
-    )
+    rows = np.concatenate([rows, solution.fact_rows[:, free]])
     precision = problem.precision[free]
     scale = np.sqrt((rows**2).sum(axis=0) + precision)
     scale = np.where(scale > 0.0, scale, 1.0)

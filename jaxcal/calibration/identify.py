@@ -93,10 +93,9 @@ def identify(
             or (False) one for each, or one for each group of (m,) labels. By default
             one for each, but of an arm one for positions and one for turns unless the
             residuals contradict it (F test, 0.1 %), and one for all where
-            ``command_std`` is given. Where fewer than 30 measurements have outputs that
-            share parameters, as trajectories, one for all, one that varies smoothly
-            along them, or one for each run or each, as the residuals show and the
-            summary says.
+            ``command_std`` is given; of under 30 measurements whose outputs share
+            parameters, as trajectories, as many as the residuals show (the summary
+            says which).
         loss: "gaussian" is least squares, the default of an affine model without prior;
             "student" (4 degrees of freedom, of a measurement as a whole), otherwise the
             default, gives outliers little weight.

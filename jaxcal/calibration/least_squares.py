@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +95,7 @@ class FitSolution:
     deleted: Array  # (N,) squared, from the fit without that measurement, in noise
     num_readings: int  # of a measurement, less its unknown commands
     freedom: Array  # (q,) residual degrees of freedom of each output
-    widest: Array | None = None  # (F,) largest columns of the system yet, at level 1
+    widest: Any = np.nan  # (F,) largest columns of the system yet, at level 1
     last_move: float = np.inf  # squared, of the step before in noise
     basis: Array | None = None  # (F, r) directions of a linear model
     solved: Array | None = None  # (R, r) roots of the hat matrix, if at hand
@@ -152,7 +153,7 @@ class FitSolution:
                 self.level = self._first_level()
                 self._linearise()
         if linear:
-            self.system = rows, _, scale = self._system(0.0)
+            self.system = rows, _, scale = self.weighted_system(0.0)
             self.basis, self.solved = directions(rows, scale)
             self.damping = _LEAST_DAMPING
             if from_zero and self.basis.shape[1] < len(self.basis):
@@ -247,7 +248,7 @@ class FitSolution:
         level, shared, basis = self.level, self.shared, self.basis
         rows, right, scale = self.system
         if self.solved is None:
-            rows, right, scale = self._system(0.0)
+            rows, right, scale = self.weighted_system(0.0)
             inverse, self.solved = factor(rows, self.damping)
             basis = basis / scale @ inverse
         cost, target = float(right @ right), self.solved.T @ right
@@ -314,7 +315,7 @@ class FitSolution:
             commands[:, self.uncertain] += change
         return commands
 
-    def _system(self, damping: float) -> tuple[Array, Array, Array]:
+    def weighted_system(self, damping: float) -> tuple[Array, Array, Array]:
         """Weighted rows (R, F), residuals (R,), scale (F,): readings, prior, facts. By
         directions, (R, r) and (r,), where the model is linear."""
         rows, right = self._reduce(damping)
@@ -340,9 +341,14 @@ class FitSolution:
         problem = self.problem
         cost = self.cost
         while True:
-            rows, right, scale = self._system(self.damping)
+            rows, right, scale = self.weighted_system(self.damping)
             if self.whole:
-                rows, scale = self._widened(rows, scale)
+                # By the largest scale so far (Moré, 1978), so that no parameter that
+                # loses its effect takes ever longer steps.
+                size = float(np.exp(np.log(self.level).mean()))
+                self.widest = np.fmax(scale * size, self.widest)
+                wide = self.widest / size
+                rows, scale = rows * (scale / wide), wide
             # Of a model that is not linear the next step makes up for rounding.
             inverse, across = factor(rows, self.damping, self.basis is None)
             self.solved = across if self.damping < 1e-9 else None
@@ -403,16 +409,6 @@ class FitSolution:
                 )
             self.damping *= self.grow
             self.grow *= 2.0
-
-    def _widened(self, rows: Array, scale: Array) -> tuple[Array, Array]:
-        """Rows and scale (F,) by the largest scale so far (Moré, 1978), so that no
-        parameter that loses its effect takes ever longer steps."""
-        size = float(np.exp(np.log(self.level).mean()))
-        self.widest = np.fmax(
-            scale * size, np.nan if self.widest is None else self.widest
-        )
-        wide = self.widest / size
-        return rows * (scale / wide), wide
 
     def _curve(self, step: Array, size: int) -> Array:
         """(size,) half the residuals' second derivative along a step (F,). Geodesic
@@ -478,7 +474,7 @@ class FitSolution:
     def _leverage(self, root: Array | None = None) -> Array:
         """(N, R, F) roots of the hat matrix, of the readings, at any level."""
         if root is None:
-            root = factor(self._system(0.0)[0], _LEAST_DAMPING)[1]
+            root = factor(self.weighted_system(0.0)[0], _LEAST_DAMPING)[1]
         count, width = len(self.weights), root.shape[1]
         readings = self.residuals.shape[1] + self.num_uncertain
         return root[: count * readings].reshape(count, readings, width)

@@ -98,33 +98,19 @@ def with_levels_apart(solution: FitSolution) -> FitSolution:
 
 def _by_facts(solution: FitSolution) -> Array:
     """(N, q) how far residuals are off by facts (``Fitting.facts``), in their noise."""
-    problem = solution.problem
-    if not len(solution.facts):
+    if not (count := len(solution.facts)):
         return np.zeros_like(solution.white)
-    slopes = solution.by_theta / solution.level[:, None]
-    prior = np.sqrt(problem.precision[problem.free])
-    root = np.sqrt(solution.weights)[:, None]
-    rows = np.concatenate(
-        [(root[..., None] * slopes).reshape(-1, len(prior)), np.diag(prior)]
-    )
-    right = np.append(
-        root * solution.white / solution.level,
-        prior * (problem.mean - solution.parameters)[problem.free],
-    )
-    size = np.linalg.norm(rows, axis=0) + 1e-300
-    step = np.linalg.lstsq(rows / size, right, rcond=1e-10)[0] / size
-    return np.asarray(slopes @ step)
+    rows, right, size = solution.weighted_system(0.0)  # facts are its last rows
+    step = np.linalg.lstsq(rows[:-count], right[:-count], rcond=1e-10)[0] / size
+    return np.asarray(solution.by_theta / solution.level[:, None] @ step)
 
 
 def _with(problem: FitProblem, levels: _Levels) -> FitProblem:
-    if levels.profile is None:
-        return dataclasses.replace(problem, levels=levels.groups)
-    return dataclasses.replace(
-        problem,
-        levels=levels.groups,
-        white=problem.white / levels.profile,
-        reading_std=problem.reading_std * levels.profile,
-    )
+    problem = dataclasses.replace(problem, levels=levels.groups)
+    if levels.profile is None:  # with the same array, by which searches know it
+        return problem
+    white, std = problem.white / levels.profile, problem.reading_std * levels.profile
+    return dataclasses.replace(problem, white=white, reading_std=std)
 
 
 def _squares(problem: FitProblem, solution: FitSolution) -> tuple[Array, Array]:

@@ -48,7 +48,6 @@ def group_scales(
     """The factors, of the problem's prior, that make the readings most probable. The
     model is made linear at ``solution``; the search begins at ``start``, with factors
     of one where there is nothing."""
-    p = len(problem.mean)
     of_model = problem.model.fitting.error_groups()
     assert of_model is not None
     groups, num_groups = of_model.members, len(of_model.medians)
@@ -67,8 +66,7 @@ def group_scales(
         gain, best, least = least.value - after.value, trial, after
         if gain < 1e-4:
             break
-    factors = np.ones(p)
-    factors[groups >= 0] = np.exp(best[groups[groups >= 0]])
+    factors = np.where(groups >= 0, np.exp(best[groups]), 1.0)
     if start is None:  # of a rough fit, which begin the next
         return PriorScales(best, factors, np.zeros((num_groups, num_groups)))
     steps = 1e-3 * np.eye(len(best))
@@ -217,7 +215,7 @@ def covariance_of_scales(solution: FitSolution, scales: PriorScales) -> Array:
     groups = of_model.members[free]
     weights = np.sqrt(np.minimum(solution.weights, 1.0))[:, None, None]
     rows = (weights * solution.rows).reshape(-1, solution.rows.shape[-1])
-    fact_rows = problem.model.fitting.facts(solution.parameters)[1][:, free]
+    fact_rows = solution.fact_rows[:, free]
     square = gram(rows) + fact_rows.T @ fact_rows
     precision = problem.precision[free]
     scale = 1.0 / np.sqrt(np.diagonal(square) + precision + 1e-300)

@@ -148,10 +148,6 @@ def _explains_nothing(fit: Fit) -> Reason | None:
     nothing = special.fdtrc(more, dof, ratio) > _CHANCE
     if not nothing.any():
         return None
-    ordered: list[str] = []
-    if not in_order(fit.commands, 0.1).any():
-        turned = np.array(fit.output_names)[in_order(fit.measured, 0.7)]
-        ordered = [name for name in names[nothing] if name in turned]
     explained = np.maximum(1.0 - share[nothing], 0.0)
     of, outputs = f"of {fit.num_measurements} rows", ", ".join(names[nothing])
     if (explained > 0.5).all():
@@ -164,7 +160,9 @@ def _explains_nothing(fit: Fit) -> Reason | None:
         f"The fit explains nothing of {outputs}: a constant fits as well (R2 = "
         f"{each(explained)} {of})."
     )
-    if ordered:
+    turned = np.array(fit.output_names)[in_order(fit.measured, 0.7)]
+    ordered = [name for name in names[nothing] if name in turned]
+    if ordered and not in_order(fit.commands, 0.1).any():
         text += (
             f" {', '.join(ordered)} never turns from the first row to the last, which "
             "the commands do: it was sorted without them, or drifts."

@@ -89,11 +89,10 @@ class SavedFiles:
                 "so both would correct them twice"
             )
         files = "--out FILE.urdf, --servos-out and --transform"
-        for option in ("unproven", "overwrite"):
-            of_table = self.repair and option == "overwrite"
-            if getattr(self, option) and not (self.corrected or of_table):
-                more = " or --repair" * (option == "overwrite")
-                raise ValueError(f"--{option} needs {files}{more}")
+        if self.unproven and not self.corrected:
+            raise ValueError(f"--unproven needs {files}")
+        if self.overwrite and not (self.corrected or self.repair):
+            raise ValueError(f"--overwrite needs {files} or --repair")
         if self.frames is not None and not self.transform:
             raise ValueError("--frames needs --transform FILE")
         if len((self.frames or "a,b").split(",")) != 2:

@@ -45,9 +45,6 @@ class Source:
             measured unit: a zero, or U / k of a certificate.
         scale: () or (m,) relative standard uncertainty of the scale of the readings.
         dof: degrees of freedom of these; infinite where they are taken as known.
-
-    Raises:
-        ValueError: nothing is stated, or a value is negative.
     """
 
     name: str
@@ -135,28 +132,31 @@ class Budget:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; infinite ones are None."""
-        columns = {
-            "name": self.names,
-            "value": self.values.tolist(),
-            "contributions": [_plain(parts) for parts in self.contributions],
-            "combined": _plain(self.combined),
-            "dof": _plain(self.dof),
-            "coverage_factor": self.coverage_factor.tolist(),
-            "expanded": _plain(self.expanded),
-        }
-        rows = zip(*columns.values(), strict=True)
-        sources = zip(self.sources, _plain(self.source_dof), strict=True)
         return {
             "confidence": self.confidence,
             "unit": self.unit,
-            "sources": [{"name": name, "dof": dof} for name, dof in sources],
-            "results": [dict(zip(columns, row, strict=True)) for row in rows],
+            "sources": by_row(name=self.sources, dof=or_none(self.source_dof)),
+            "results": by_row(
+                name=self.names,
+                value=self.values.tolist(),
+                contributions=[or_none(parts) for parts in self.contributions],
+                combined=or_none(self.combined),
+                dof=or_none(self.dof),
+                coverage_factor=self.coverage_factor.tolist(),
+                expanded=or_none(self.expanded),
+            ),
         }
 
 
-def _plain(values: Array) -> list[float | None]:
+def or_none(values: Array) -> list[float | None]:
     """Numbers that JSON can hold, None for those that are not finite."""
     return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def by_row(**columns: Sequence[Any]) -> list[dict[str, Any]]:
+    """An object for each row of columns, as JSON has tables."""
+    rows = zip(*columns.values(), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 def budget(
@@ -183,9 +183,6 @@ def budget(
             the calibration, so an offset that both share cancels.
         sources: what the scatter of the readings does not show: zero, certificate.
         confidence: of the expanded uncertainty, in (0, 1).
-
-    Raises:
-        ValueError: the noise is unknown, or an argument is wrong, by name.
     """
     noise_of(calibration, "uncertainty budget")
     quantile(calibration, confidence)  # must be in (0, 1)

@@ -33,7 +33,7 @@ from jaxcal.extras import needs
 from jaxcal.files import AnyPath, write_text
 from jaxcal.models.model import Quantity
 from jaxcal.reports import page as pages
-from jaxcal.reports.budget import Budget, Source, budget
+from jaxcal.reports.budget import Budget, Source, budget, by_row, or_none
 from jaxcal.tables import COMMANDS, MEASURED
 
 if TYPE_CHECKING:
@@ -48,39 +48,27 @@ SCHEMA: dict[str, Any] = json.loads(
 
 
 def moved(calibration: Fit, before: Fit) -> list[dict[str, Any]]:
-    """What moved since another calibration of the same parameters.
-
-    Returns:
-        For each parameter its name, both values, the difference, and that in standard
-        deviations of the difference, None where neither has one.
-
-    Raises:
-        ValueError: the parameters are not the same.
-    """
+    """What moved since another calibration of the same parameters: of each its name,
+    both values, the difference, and that in standard deviations of the difference, None
+    where neither has one."""
     if calibration.names != before.names:
         raise ValueError(
             "before must be a calibration of the same parameters, got "
             f"{len(before.names)} ({', '.join(before.names[:4])}, ...) for "
             f"{len(calibration.names)} ({', '.join(calibration.names[:4])}, ...)"
         )
-    variance = np.zeros(len(calibration.names))
-    for fit in (calibration, before):
-        errors = fit.standard_errors
-        variance = variance + (np.inf if errors is None else errors**2)
+    errors = [calibration.standard_errors, before.standard_errors]
+    variance = sum(np.inf if error is None else error**2 for error in errors)
     difference = calibration.parameters - before.parameters
     with np.errstate(divide="ignore", invalid="ignore"):
         times = difference / np.sqrt(variance)
-    sure = np.isfinite(variance) & (variance > 0.0)
-    return [
-        {
-            "name": name,
-            "before": float(before.parameters[i]),
-            "after": float(calibration.parameters[i]),
-            "difference": float(difference[i]),
-            "deviations": float(times[i]) if sure[i] else None,
-        }
-        for i, name in enumerate(calibration.names)
-    ]
+    return by_row(
+        name=calibration.names,
+        before=before.parameters.tolist(),
+        after=calibration.parameters.tolist(),
+        difference=difference.tolist(),
+        deviations=or_none(np.where(np.isinf(variance), np.nan, times)),
+    )
 
 
 def report(
@@ -105,11 +93,6 @@ def report(
 
     Returns:
         Whether it is good: may be used, or of a check, that it holds.
-
-    Raises:
-        MissingExtraError: jinja2 is not installed.
-        OSError: the folder cannot be written, or a file not be read.
-        ValueError: ``before`` has other parameters.
     """
     content = json.dumps(calibration.to_dict(), indent=1, allow_nan=False) + "\n"
     data = {os.fspath(path): pathlib.Path(path).read_bytes() for path in files}
@@ -141,18 +124,16 @@ def report(
 
 def _document(calibration: Calibration, check: Check | None) -> dict[str, Any]:
     """What ``verdict.json`` says of a calibration, or of its check."""
-    verdict = calibration.verdict
-    good, reasons, next_step = verdict.good, verdict.lines(), verdict.next_step
-    if check is not None:
-        good, reasons, next_step = check.good, check.reasons, check.next_step
+    verdict = check or calibration.verdict
+    lines = check.reasons if check else calibration.verdict.lines()
     return {
         "format": "jaxcal-verdict",
         "version": 1,
-        "of": "identify" if check is None else "check",
-        "good": good,
-        "exit_code": 0 if good else 1,
-        "reasons": list(reasons),
-        "next_step": next_step,
+        "of": "check" if check else "identify",
+        "good": verdict.good,
+        "exit_code": 0 if verdict.good else 1,
+        "reasons": list(lines),
+        "next_step": verdict.next_step,
         "unit": calibration.measured_unit,
         "numbers": _numbers(calibration, check),
     }
@@ -187,18 +168,16 @@ def _numbers(calibration: Calibration, check: Check | None) -> dict[str, Any]:
         "nominal_mean": nominal_errors(calibration),
     }
     for name, off in errors.items():
+        if off is None:
+            continue
         for in_unit, quantity in named(calibration, name):
-            if off is not None and name == "residual_rms":
-                square = np.mean(off[:, quantity.columns] ** 2)
-                numbers[in_unit] = float(np.sqrt(square))
-            elif off is not None:
-                numbers[in_unit] = float(quantity.size(off).mean())
+            size = quantity.size(off).mean()
+            if name == "residual_rms":
+                size = np.sqrt(np.mean(off[:, quantity.columns] ** 2))
+            numbers[in_unit] = float(size)
     if check is not None:
-        numbers |= {
-            "check_says": check.says,
-            "check_p": check.p_value,
-            "check_power": check.power,
-        }
+        numbers["check_says"] = check.says
+        numbers |= {"check_p": check.p_value, "check_power": check.power}
         names = (name for name, _ in named(calibration, "check_tolerance"))
         numbers |= zip(names, check.tolerances.values(), strict=False)
     return numbers
@@ -235,9 +214,7 @@ def _page_of(
 
 def _verdict_section(calibration: Fit, document: Mapping[str, Any]) -> pages.Section:
     good, numbers = document["good"], document["numbers"]
-    word = "good" if good else "not good"
-    if document["of"] == "check":
-        word = str(numbers["check_says"])
+    word = numbers.get("check_says", "good" if good else "not good")
     sizes = "residual_rms", "held_out_mean", "nominal_mean", "check_tolerance"
     all_named = itertools.chain.from_iterable(named(calibration, n) for n in sizes)
     units = {name: q.unit for name, q in all_named if q.unit != "length"}
@@ -246,16 +223,15 @@ def _verdict_section(calibration: Fit, document: Mapping[str, Any]) -> pages.Sec
         for name, value in numbers.items()
         if value is not None
     ]
-    blocks: list[pages.Block] = [pages.Text(line) for line in document["reasons"]]
-    blocks.append(pages.Text(f"Next: {document['next_step']}."))
-    blocks.append(pages.Table(("", "value"), rows))
+    lines = [*document["reasons"], f"Next: {document['next_step']}."]
     badge = pages.Badge(word, "good" if good else "bad")
-    return pages.Section("Verdict", blocks, "verdict", badge)
+    table = pages.Table(("", "value"), rows)
+    return pages.Section("Verdict", [*lines, table], "verdict", badge)
 
 
 def _parameter_section(calibration: Fit, budgets: Sequence[Budget]) -> pages.Section:
     """The parameters with their budget, or without one where no noise is known."""
-    blocks: list[pages.Block]
+    note: pages.Block
     if budgets:
         rows = budgets[0].rows()
         if units := _units(calibration):
@@ -265,14 +241,12 @@ def _parameter_section(calibration: Fit, budgets: Sequence[Budget]) -> pages.Sec
             "Standard uncertainties by source (GUM), effective degrees of freedom by "
             "Welch and Satterthwaite, coverage factor k, expanded uncertainty U."
         )
-        blocks = [pages.Table(rows[0], rows[1:]), note]
     else:
         cells = zip(calibration.names, calibration.parameters, strict=True)
-        blocks = [
-            pages.Table(("", "value"), [[name, f"{x:.6g}"] for name, x in cells]),
-            pages.Text(no_noise(calibration, "intervals"), "warning"),
-        ]
-    return pages.Section("Parameters", blocks, "parameters")
+        rows = [["", "value"], *([name, f"{x:.6g}"] for name, x in cells)]
+        note = pages.Text(no_noise(calibration, "intervals"), "warning")
+    table = pages.Table(rows[0], rows[1:])
+    return pages.Section("Parameters", [table, note], "parameters")
 
 
 def _prediction_section(calibration: Fit, budget: Budget) -> pages.Section:

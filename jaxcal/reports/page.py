@@ -18,21 +18,6 @@ from jaxcal.files import AnyPath, write_text
 
 
 @dataclasses.dataclass(frozen=True)
-class Link:
-    """A link to a section (``#key``) or to a file beside the page."""
-
-    text: str
-    href: str
-
-    def __post_init__(self) -> None:
-        if ":" in self.href or self.href.startswith("/"):
-            raise ValueError(
-                "href must be '#key' or a path relative to the page, which works "
-                f"without a network, got {self.href!r}"
-            )
-
-
-@dataclasses.dataclass(frozen=True)
 class Badge:
     """A short word in a coloured outline: a verdict."""
 
@@ -47,7 +32,7 @@ class Code:
     text: str
 
 
-Inline = str | Link | Badge | Code
+Inline = str | Badge | Code
 Content = Inline | Sequence[Inline]
 """A piece of text, or several that follow one another"""
 
@@ -87,11 +72,7 @@ class Figure:
 
     @property
     def uri(self) -> str:
-        """The file as a data URI.
-
-        Raises:
-            ValueError: it is not an SVG file.
-        """
+        """The file as a data URI."""
         if b"<svg" not in self.data[:1000]:
             raise ValueError(f"figure {self.alt!r} must be an SVG file")
         return f"data:image/svg+xml;base64,{base64.b64encode(self.data).decode()}"
@@ -106,7 +87,7 @@ class Section:
 
     title: str
     blocks: Sequence[Block]
-    key: str = ""  # what ``Link("...", "#key")`` leads to
+    key: str = ""  # what a link to "#key" leads to
     badge: Badge | None = None  # beside the heading
 
 
@@ -122,12 +103,7 @@ class Page:
 
 
 def render(page: Page) -> str:
-    """The HTML file as text.
-
-    Raises:
-        MissingExtraError: jinja2 is not installed.
-        ValueError: a figure is not an SVG file.
-    """
+    """The HTML file as text; a ValueError where a figure is not an SVG file."""
     return str(_template().render(page=page)).lstrip()
 
 
@@ -163,9 +139,5 @@ def template(
 
 
 def write_page(path: AnyPath, page: Page) -> None:
-    """Write the page atomically.
-
-    Raises:
-        OSError: the folder is missing, not writable or full.
-    """
+    """Write the page atomically."""
     write_text(path, render(page))

@@ -95,12 +95,6 @@ def points(index: int) -> dict[str, Any]:
     return numbered(index) | {"linestyle": "none", "markersize": 4}
 
 
-def band(axes: Any, x: Any, value: Any, low: Any, high: Any, **look: Any) -> None:
-    """A curve (N,) with its interval shaded; ``look`` is that of the curve."""
-    axes.fill_between(x, low, high, color=look["color"], alpha=0.25, linewidth=0)
-    axes.plot(x, value, **look)
-
-
 def boxes(
     axes: Any, samples: Any, colours: Sequence[str], ends: tuple[int, int], **rest: Any
 ) -> None:

@@ -34,9 +34,6 @@ def plot_selection(selection: Any, axes: Any = None) -> Any:
 
     Returns:
         The axes; ``axes.figure.savefig(path)`` writes a file.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
     """
     candidates, chosen = selection.problem.candidates, selection.indices
     count = 0 if candidates is None else candidates.shape[1]
@@ -66,20 +63,16 @@ def plot_selection(selection: Any, axes: Any = None) -> Any:
 
 
 def plot_calibration(calibration: Any, axes: Any = None) -> Any:
-    """Residuals, measured less fitted, in the order of measurement.
-
-    Args, returns and raises as ``Selection.plot``.
-    """
+    """Residuals, measured less fitted, in the order of measurement; arguments and
+    answer as of ``Selection.plot``."""
     axes, plots = _drawing(axes)
     names, unit = calibration.output_names, calibration.measured_unit
     return plots.residuals(axes, calibration.residuals, names, unit)
 
 
 def plot_plan(plan: Any, axes: Any = None) -> Any:
-    """Accuracy against the number of measurements, and the target.
-
-    Args, returns and raises as ``Selection.plot``.
-    """
+    """Accuracy against the number of measurements, and the target; arguments and answer
+    as of ``Selection.plot``."""
     axes, plots = _drawing(axes)
     return plots.plan(axes, plan)
 

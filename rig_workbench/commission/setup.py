@@ -340,8 +340,7 @@ def look_at_phone(site: steps.Site, seconds: float = WATCH_S) -> str:
         )
         for listener in site.listeners:
             listener({"event": "listening", "port": imu.port})
-        geometry = geometry_of(config)
-        watch(imu, geometry, seconds, STREAM_WAIT_S, site.say)
+        _watch(imu, geometry_of(config), seconds, site.say)
         if isinstance(imu, Imu):
             sent = imu.parser
             site.say(f"  it sends {sent.first[:SHOWN]}\n  read as {sent.taken_for}")
@@ -358,16 +357,12 @@ def place_text(settings: ImuSettings | ReadingsSettings, port: int) -> str:
     return f"readings from {getattr(settings, 'device', '') or place}"
 
 
-def watch(
-    imu: Source,
-    geometry: Geometry,
-    seconds: float,
-    wait_s: float,
-    say: Callable[[str], None],
+def _watch(
+    imu: Source, geometry: Geometry, seconds: float, say: Callable[[str], None]
 ) -> None:
-    """Wait for an open stream and look at it for so long, telling each second;
-    ReadingError where nothing comes, or the stream is not to be trusted."""
-    start, spent = imu.wait_for_stream(wait_s).time, 0.0
+    """Look at an open stream for so long, telling each second; ReadingError where
+    nothing comes, or the stream is not to be trusted."""
+    start, spent = imu.wait_for_stream(STREAM_WAIT_S).time, 0.0
     while spent < seconds:
         time.sleep(min(LOOK_S, seconds - spent))
         imu.latest()

@@ -7,7 +7,6 @@ Figures need matplotlib; without it the page says so.
 from __future__ import annotations
 
 import datetime
-import functools
 import json
 import pathlib
 from collections.abc import Callable, Sequence
@@ -48,9 +47,8 @@ def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
     rows = [[f"{time_of(when):%H:%M:%S}", line] for when, line in state.log]
     table = Table(["", ""], rows, numeric=False)
     sections.append(Section("What happened", [table]))
-    path, kind = folder / "report.html", str(start["mode"])
-    kind = "Calibration" if kind == "calibrate" else kind.capitalize()
-    title = f"{kind} {folder.name}"
+    kind = "calibration" if start["mode"] == "calibrate" else str(start["mode"])
+    title, path = f"{kind.capitalize()} {folder.name}", folder / "report.html"
     write_page(path, Page(title, sections, intro=intro, footer=(FOOTER,)))
     return path
 
@@ -75,8 +73,7 @@ def _result(state: RunState, summary: Record) -> list[Section]:
             shown = {"as designed": "before", "calibrated": "prediction"}
         errors = {t: summary[key]["each"] for t, key in shown.items() if key in summary}
         alt = f"held-out errors in {state.unit}, {' and '.join(errors)}"
-        draw = functools.partial(draw_errors, names=outputs, unit=state.unit)
-        parts.append(drawn(draw, errors, (9, 3.4), alt))
+        parts.append(drawn(draw_errors, (errors, outputs, state.unit), (9, 3.4), alt))
     sections = [Section("Result", parts)] if parts else []
     if changes := summary.get("changed"):
         rows = [[key, str(old), str(new)] for key, (old, new) in changes.items()]
@@ -115,13 +112,13 @@ def _measured(state: RunState, records: list[Record]) -> Section:
     head[1] += f" [{state.axis_unit}]"
     more = f", the first {MOST_ROWS} of them" if len(postures) > MOST_ROWS else ""
     table = Table(head, rows, f"{len(postures)} measured{more}")
-    draw = functools.partial(draw_postures, names=state.names[0], unit=state.axis_unit)
-    picture = drawn(draw, postures, (6, 5), "commanded postures")
+    data = postures, state.names[0], state.axis_unit
+    picture = drawn(draw_postures, data, (6, 5), "commanded postures")
     return Section("Postures", [picture, table])
 
 
 def drawn(
-    draw: Callable[[Any, Any], None], data: Any, size: tuple[float, float], alt: str
+    draw: Callable[..., None], data: Sequence[Any], size: tuple[float, float], alt: str
 ) -> Any:
     """A block of a page: the figure, or words where matplotlib is not installed."""
     try:
@@ -132,7 +129,7 @@ def drawn(
         missing = f"no figure: matplotlib is not installed ({install('plots')})"
         return Text(f"{alt}: {missing}", "note")
     figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
-    draw(figure, data)
+    draw(figure, *data)
     return Figure(as_bytes(figure, "svg"), alt)
 
 

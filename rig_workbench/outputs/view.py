@@ -105,18 +105,13 @@ def numbers(
             ("std", outputs),
         )
     ]  # fmt: skip
-    rows: list[Any] = [
-        (name, *(column.get(name) for column in columns))
-        for name in dict.fromkeys([*axes, *outputs])
-    ]
-    return [
-        (
-            name, angle(a), angle(d), angle(y),
-            angle(y - a if running and a is not None and y is not None else None),
-            "–" if s is None else f"{s:.3f}",
-        )
-        for name, a, d, y, s in rows
-    ]  # fmt: skip
+    rows: list[tuple[str, ...]] = []
+    for name in dict.fromkeys([*axes, *outputs]):
+        a, d, y, s = (column.get(name) for column in columns)
+        off = y - a if running and a is not None and y is not None else None
+        spread = "–" if s is None else f"{s:.3f}"
+        rows.append((name, angle(a), angle(d), angle(y), angle(off), spread))
+    return rows
 
 
 def stream(sample: Record, now: float) -> str:

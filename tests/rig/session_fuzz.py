@@ -48,8 +48,8 @@ from rig_workbench.simulator import Truth
 from rig_workbench.simulator.drive import SimDrive
 from rig_workbench.simulator.faults import FaultInjector, FaultSpec
 from rig_workbench.simulator.phone import format_line
-from rig_workbench.simulator.plant import Plant
 from rig_workbench.simulator.server import ModbusServer
+from rig_workbench.simulator.simulator import Plant
 
 POSTURES = 3
 RATE_HZ = 50.0

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.paper.exhibits.devices import Device, pick, rms
 from benchmarks.paper.exhibits.exhibit import Exhibit, from_rows, judge
 from benchmarks.paper.exhibits.intervals import (
+    band,
     mean_interval,
     median_interval,
     ratio_interval,
@@ -27,7 +28,7 @@ from benchmarks.paper.exhibits.study import Study, commands_deg, predict
 from jaxcal.evaluation.methods import least_squares
 from jaxcal.information.regression import regressors
 from jaxcal.paper.datasets import NOISE_STD_DEG
-from jaxcal.reports.plots import BLACK, band, numbered, panels, plain_log
+from jaxcal.reports.plots import BLACK, numbered, panels, plain_log
 from jaxcal.selection import exchange_batch
 
 Array = NDArray[np.float64]

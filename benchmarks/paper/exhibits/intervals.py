@@ -93,3 +93,9 @@ def ratio_interval(
 ) -> Interval:
     """``of(a) / of(b)``, such as of means, of (E,) values on the same episodes."""
     return bootstrap_interval(lambda x, y: of(x) / of(y), (a, b), rng, resamples)
+
+
+def band(axes: Any, x: Any, value: Any, low: Any, high: Any, **look: Any) -> None:
+    """A curve (N,) with its interval shaded; ``look`` is that of the curve."""
+    axes.fill_between(x, low, high, color=look["color"], alpha=0.25, linewidth=0)
+    axes.plot(x, value, **look)

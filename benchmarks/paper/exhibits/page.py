@@ -23,6 +23,20 @@ _TONES: dict[Verdict, tuple[Literal["good", "fair", "bad", "neutral"], str]] = {
 }
 
 
+@dataclasses.dataclass(frozen=True)
+class Link(pages.Code):
+    """A link to a section (``#key``) or to a file beside the page."""
+
+    href: str
+
+    def __post_init__(self) -> None:
+        if ":" in self.href or self.href.startswith("/"):
+            raise ValueError(
+                "href must be '#key' or a path relative to the page, which works "
+                f"without a network, got {self.href!r}"
+            )
+
+
 def page(
     exhibits: Sequence[Exhibit],
     claims: Sequence[Claim],
@@ -51,7 +65,7 @@ def page(
     ]
     rows = [
         (
-            pages.Link(_typeset(claim.claim), f"#{claim.where}"),
+            Link(_typeset(claim.claim), f"#{claim.where}"),
             *(_typeset(claim.paper), _typeset(claim.ours), _badge(claim.verdict)),
         )
         for claim in claims
@@ -85,7 +99,7 @@ def _section(exhibit: Exhibit, images: Mapping[str, bytes]) -> pages.Section:
         blocks.append(pages.Text(_typeset(exhibit.caption), "note"))
     files: list[pages.Inline] = []
     for name in exhibit.tables:
-        files += [", " if files else "Data: ", pages.Link(name, f"data/{name}")]
+        files += [", " if files else "Data: ", Link(name, f"data/{name}")]
     if files:
         blocks.append(pages.Text(files, "note"))
     badge = None if exhibit.verdict is None else _badge(exhibit.verdict)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.paper.exhibits.devices import Device, pick, rms
 from benchmarks.paper.exhibits.exhibit import Exhibit, by_axis, from_rows, judge
 from benchmarks.paper.exhibits.intervals import (
+    band,
     median_interval,
     ratio_interval,
     share_interval,
@@ -30,7 +31,6 @@ from jaxcal.reports.plots import (
     COLOURS,
     GREY,
     MARKERS,
-    band,
     legend_right,
     panels,
 )

@@ -17,14 +17,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.paper.exhibits.exhibit import Exhibit, Verdict, judge
-from benchmarks.paper.exhibits.intervals import mean_interval
+from benchmarks.paper.exhibits.intervals import band, mean_interval
 from benchmarks.paper.exhibits.study import Study
 from jaxcal.evaluation.figures import (
     last_rewards,
     read_metrics,
     training_curves,
 )
-from jaxcal.reports.plots import COLOURS, GREY, band, boxes, panels
+from jaxcal.reports.plots import COLOURS, GREY, boxes, panels
 
 Array = NDArray[np.float64]
 
