@@ -276,6 +276,10 @@ class Arm:
         goes[at] += np.einsum("hk,hkn->hn", waves, rates)
         return by_waves, goes
 
+    def _driven_by(self, i: int) -> dict[str, float]:
+        """The columns that move joint ``i``, from 0, and how far."""
+        return {self.joint_names[k]: x for k, x in enumerate(self.drive[i]) if x}
+
     def _moves(self, commands: Array) -> Array:
         """(N, n) how far each joint moves, before its gear."""
         return commands[:, : self.num_joints] @ self.drive.T + self.offset
@@ -377,7 +381,7 @@ class Arm:
         moved = np.zeros_like(axes)
         for (link, weight, centre), end in zip(self.loads, ends, strict=True):
             point = end[3] + np.einsum("k,kcn->cn", centre, end[:3])
-            motion = _cross(axes[:link], point - origins[:link])
+            motion = np.cross(axes[:link], point - origins[:link], axis=-2)
             slides = ~self._revolute[:link]
             motion[slides] = axes[:link][slides]
             moved[:link] += weight * motion
@@ -399,7 +403,7 @@ class Arm:
         at, joints = np.array(self.compliance)[:, None] - 1, np.arange(len(axes))
         first, second = np.minimum(at, joints), np.maximum(at, joints)
         axes[~self._revolute] = 0.0
-        across = _cross(np.array(self.gravity)[:, None], axes)
+        across = np.cross(np.array(self.gravity)[:, None], axes, axis=-2)
         rate = np.einsum("ijcn,ijcn->ijn", across[first], moved[second])
         rate[:, self._revolute] = np.radians(rate[:, self._revolute])
         return rate
@@ -425,13 +429,6 @@ def apparent_length(table: Array, tool: Array) -> tuple[float, int]:
     return together, 1 + int(np.abs(table[:, 2]).argmax())
 
 
-def _cross(left: Array, right: Array) -> Array:
-    """Cross products of (..., 3, N): over the axis before the last."""
-    x, y, z = (left[..., k, :] for k in range(3))
-    u, v, w = (right[..., k, :] for k in range(3))
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-2)
-
-
 def common(one: Arm, other: Arm) -> int:
     """Leading joints that two chains have in common, with the links before them."""
     stands = np.allclose(one.base, other.base, atol=_SAME)
@@ -439,13 +436,8 @@ def common(one: Arm, other: Arm) -> int:
         return 0
     least = min(len(one.joints), len(other.joints))
     for i in range(least):
-        names, moves = [], []
-        for arm in (one, other):
-            moved = np.flatnonzero(arm.drive[i])
-            names.append([arm.joint_names[k] for k in moved])
-            moves.append(arm.drive[i][moved])
         link = i == 0 or np.allclose(one.table[i - 1], other.table[i - 1], atol=_SAME)
-        alike = names[0] == names[1] and np.array_equal(*moves)
-        if not (link and alike and one.joints[i] == other.joints[i]):
+        moves = one._driven_by(i) == other._driven_by(i)
+        if not (link and moves and one.joints[i] == other.joints[i]):
             return i
     return least

@@ -63,8 +63,6 @@ class SerialChain(Arm, Model):
     at_rest = late("jaxcal.arms.files.recordings:at_rest")
     recorded = late("jaxcal.arms.files.recordings:recorded")
     write = late("jaxcal.arms.files.write:write")
-    standing_as = late("jaxcal.arms.files.write:standing_as")
-    write_servos = late("jaxcal.arms.files.recordings:write_servos")
 
     @property
     def fitting(self) -> ArmFitting:
@@ -244,17 +242,17 @@ class SerialChain(Arm, Model):
         harmonics: Sequence[int] = (),
     ) -> Self:
         """This arm with these effects of joints, from 1, beside those that it has."""
-        arm = self
-        if compliance and not arm.compliance:
-            loads = arm.loads or _usual_loads(len(arm.joints), arm.tool)
-            arm = dataclasses.replace(arm, compliance=tuple(compliance), loads=loads)
-            arm = dataclasses.replace(arm, yields=np.zeros(len(compliance)))
-        if gears:
-            arm = dataclasses.replace(arm, gears=tuple(gears))
-        if harmonics and not arm.harmonics:
-            waves = np.zeros((len(harmonics), 4))
-            arm = dataclasses.replace(arm, harmonics=tuple(harmonics), waves=waves)
-        return arm
+        new: dict[str, Any] = {"gears": tuple(gears)} if gears else {}
+        if compliance and not self.compliance:
+            new |= {
+                "compliance": tuple(compliance),
+                "yields": np.zeros(len(compliance)),
+            }
+            new["loads"] = self.loads or _usual_loads(len(self.joints), self.tool)
+        if harmonics and not self.harmonics:
+            new["harmonics"] = tuple(harmonics)
+            new["waves"] = np.zeros((len(harmonics), 4))
+        return dataclasses.replace(self, **new)
 
     @functools.cached_property
     def _bent(self) -> Self:  # kept, and what it keeps with it
@@ -314,7 +312,7 @@ class SerialChain(Arm, Model):
             at = [j + self.sensor.inputs.index(name) for name in one.inputs]
             noise = one.stds(self.length)
             named.append(OneTable(one.kind, i, [*range(j), *at], noise, *pair))
-        return stacked(named, j, self.inputs, self.num_inputs, self.num_outputs)
+        return stacked(self, j, named)
 
     @functools.cached_property
     def command_units(self) -> tuple[str, ...]:

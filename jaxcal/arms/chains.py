@@ -21,13 +21,7 @@ from jaxcal.arms.sensors.several import OneTable, stacked
 from jaxcal.checks import Array, one_of
 from jaxcal.files import AnyPath
 from jaxcal.late import late
-from jaxcal.models.model import (
-    Model,
-    Rows,
-    Theta,
-    as_commands,
-    as_parameters,
-)
+from jaxcal.models.model import Model, Rows, Theta, as_commands, as_parameters
 from jaxcal.models.uncertainty import Noise, Prior
 
 ChainTable = tuple[int, Array, Array | None]  # which, its commands, what it read
@@ -55,8 +49,7 @@ class Chains(Model):
     """
 
     # Of modules that know this one.
-    of_chain = late("jaxcal.arms.verdict:of_chain")
-    write = late("jaxcal.arms.files.write:write_chains")
+    write = late("jaxcal.arms.files.write:write")
 
     tips: tuple[str, ...]
     chains: tuple[SerialChain, ...]
@@ -266,9 +259,7 @@ class Chains(Model):
         return arm.sensor.stds(arm.length or 1.0)
 
     def _by_member(
-        self,
-        arms: Sequence[SerialChain],
-        tables: Sequence[ChainTable],
+        self, arms: Sequence[SerialChain], tables: Sequence[ChainTable]
     ) -> dict[int, list[Readings]]:
         """What each chain read of a sensor, by its number."""
         by_member: dict[int, list[Readings]] = {}
@@ -319,8 +310,7 @@ class Chains(Model):
         for tip, pair in tables.items():
             k = self.tips.index(one_of("tip", tip, self.tips))
             named.append(OneTable(tip, k, self._columns[k], self._scale(k), *pair))
-        place, q = len(self.joint_names), self.num_outputs
-        return stacked(named, place, self.inputs, self.num_inputs, q)
+        return stacked(self, len(self.joint_names), named)
 
     @property
     def nominal(self) -> Array:

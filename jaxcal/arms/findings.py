@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.sensors import Socket, Wrench
-from jaxcal.arms.sensors.sensor import Readings
+from jaxcal.arms.sensors.sensor import Readings, facts_of
 from jaxcal.calibration.fit import outputs_at, stated_prior
 from jaxcal.calibration.fit_model import fitted_again
 from jaxcal.calibration.reasons import Reason, in_rows
@@ -249,7 +249,7 @@ def other_distances(
         distances = getattr(part.sensor, "distances", ())
         if not len(distances):
             continue
-        off, rows = _facts(fit, part)
+        off, rows = facts_of([(part.sensor, part.own)], fit.parameters)
         _, facts = fit.model.fitting.facts(fit.parameters)
         spread = rows @ _at_these_sizes(fit, facts)
         share = np.minimum((spread * rows).sum(axis=1), 1.0 - 1e-9)
@@ -275,14 +275,6 @@ def other_distances(
     return said, most > _WRONG * length
 
 
-def _facts(fit: Fit, part: Readings) -> tuple[Array, Array]:
-    """What is known of a sensor's things: (F,) off, (F, p) derivative."""
-    off, own = part.sensor.facts(fit.parameters[part.own])
-    rows = np.zeros((len(off), len(fit.names)))
-    rows[:, part.own] = own
-    return off, rows
-
-
 def _freed(fit: Fit, part: Readings, row: int) -> tuple[float, float]:
     """A given distance as the readings have it without it, and its deviation."""
     model, touched = fit.model, part.touched()
@@ -295,7 +287,7 @@ def _freed(fit: Fit, part: Readings, row: int) -> tuple[float, float]:
     _, _, distance, std = distances[row]
     if again.covariance is None:  # too few readings to tell the noise without it
         return distance, np.inf
-    off, rows = _facts(again, part)
+    off, rows = facts_of([(part.sensor, part.own)], again.parameters)
     variance = rows[row] @ again.covariance @ rows[row]
     return distance - std * off[row], std * float(np.sqrt(variance))
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.arms.arm import Arm
+from jaxcal.arms.sensors.sensor import facts_of
 from jaxcal.checks import Array
 from jaxcal.late import late
 from jaxcal.models.model import ErrorGroups, Fitting, as_parameters
@@ -76,11 +77,9 @@ class ArmFitting(Fitting):
         return self.model.sensor.wrapped(off, columns, self.model.length)
 
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
-        theta, at = as_parameters(self.model, parameters), self.model._at["sensor"]
-        off, rows = self.model.sensor.facts(theta[at])
-        slopes = np.zeros((len(off), len(theta)))
-        slopes[:, at] = rows
-        return off, slopes
+        members = enumerate(self.model.sensor.members)
+        at = [(sensor, self.model.own(i)) for i, sensor in members]
+        return facts_of(at, as_parameters(self.model, parameters))
 
     def log_size(self, commands: Array, parameters: Array) -> Array | None:
         """Logarithm of how far the joints move the tip (N,).
@@ -194,16 +193,11 @@ class ChainsFitting(Fitting):
         return slopes
 
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
-        theta = as_parameters(self.model, parameters)
-        offs, rows = [np.zeros(0)], [np.zeros((0, len(theta)))]
+        at = []
         for (k, i), *_ in self.model._members:  # a distance is known once
             arm = self.model.chains[k]
-            columns = self.model.members[k][arm.own(i)]
-            off, slopes = arm.sensor.members[i].facts(theta[columns])
-            offs.append(off)
-            rows.append(np.zeros((len(off), len(theta))))
-            rows[-1][:, columns] = slopes
-        return np.concatenate(offs), np.concatenate(rows)
+            at.append((arm.sensor.members[i], self.model.members[k][arm.own(i)]))
+        return facts_of(at, as_parameters(self.model, parameters))
 
     def error_groups(self) -> ErrorGroups:
         """Groups as of an arm of each chain, of harmonics one for all, last; what

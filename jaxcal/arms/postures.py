@@ -132,17 +132,16 @@ class ReachableSet:
     ) -> tuple[Array, list[str]]:
         """Commands moved to where the sensor reads, of a camera to views drawn from
         ``rng``, and why it does not ("" where it does)."""
-        arm, (low, high) = self.arm, self.limits.T
-        reasons = [""] * len(commands)
+        arm, reasons = self.arm, [""] * len(commands)
         if self.view is not None:
             if rng is not None:
-                commands = aimed(arm, commands, low, high, self.view, rng)
+                commands = self._drawn_views(commands, self.view, rng)
             commands, reasons = in_picture(arm, commands, self.view)
         elif arm.sensor.views:
             commands, reasons = in_view(arm, commands)
         elif arm.sensor.zeros:
             limit = _REACHED * (arm.length or 1.0)
-            commands = towards_zero(arm, commands, low, high, limit)
+            commands = towards_zero(arm, commands, self.limits, limit)
             reached = np.linalg.norm(arm.predict(commands), axis=1) <= limit
             why = "cannot reach it within the limits"
             reasons = ["" if one else why for one in reached]
@@ -159,6 +158,35 @@ class ReachableSet:
             for i in np.flatnonzero(below):
                 reasons[i] = reasons[i] or "are below the floor"
         return commands, reasons
+
+    def _drawn_views(
+        self, commands: Array, view: View, rng: np.random.Generator
+    ) -> Array:
+        """Commands towards poses of the board in the camera that are drawn."""
+        j, count = self.arm.num_joints, len(commands)
+        board, posed = _posed(self.arm)
+        width, height, fx, fy, cx, cy = view.camera
+        far = rng.uniform(*view.ends, count)
+        aim = rng.uniform(0.25, 0.75, (count, 2)) * [width, height]
+        centre = np.column_stack([(aim - [cx, cy]) / [fx, fy], np.ones(count)])
+        centre *= (far / np.linalg.norm(centre, axis=1))[:, None]
+        # A board that faces the camera, turned about its axis, then tilted.
+        side = np.full(count, view.side)
+        if not view.side:
+            side = rng.choice([-1.0, 1.0], count)
+        facing = Rotation.from_rotvec((side[:, None] > 0.0) * [np.pi, 0.0, 0.0])
+        about_axis = rng.uniform(-np.pi, np.pi, count)[:, None]
+        spin = Rotation.from_rotvec(about_axis * [0.0, 0.0, 1.0])
+        about = rng.uniform(-np.pi, np.pi, count)
+        angle = np.radians(view.tilt) * np.sqrt(rng.random(count)) * 0.95
+        lean = np.column_stack([np.cos(about), np.sin(about), 0.0 * about])
+        turn = Rotation.from_rotvec(angle[:, None] * lean) * spin * facing
+        shift = centre - turn.apply(board.outline.mean(axis=0))
+        goals = np.hstack([commands[:, :j], shift, turn.as_rotvec(degrees=True)])
+        length = self.arm.length or 1.0
+        unit = np.repeat([1.0 / length, np.radians(1.0)], 3)
+        moved = towards_zero(posed, goals, self.limits, 1e-2, unit)
+        return np.hstack([moved[:, :j], commands[:, j:]])
 
     def drawn(self, count: int, seed: int) -> Array:
         """(count, n) commands from random starts, in an order of little travel."""
@@ -358,39 +386,6 @@ def in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     return commands, reasons.tolist()
 
 
-def aimed(
-    arm: Chain,
-    commands: Array,
-    low: Array,
-    high: Array,
-    view: View,
-    rng: np.random.Generator,
-) -> Array:
-    """Commands towards poses of the board in the camera that are drawn."""
-    j, count = arm.num_joints, len(commands)
-    board, posed = _posed(arm)
-    middle = board.outline.mean(axis=0)
-    width, height, fx, fy, cx, cy = view.camera
-    far = rng.uniform(*view.ends, count)
-    aim = rng.uniform(0.25, 0.75, (count, 2)) * [width, height]
-    centre = np.column_stack([(aim - [cx, cy]) / [fx, fy], np.ones(count)])
-    centre *= (far / np.linalg.norm(centre, axis=1))[:, None]
-    # A board that faces the camera, turned about its axis, then tilted.
-    side = np.full(count, view.side) if view.side else rng.choice([-1.0, 1.0], count)
-    facing = Rotation.from_rotvec((side[:, None] > 0.0) * [np.pi, 0.0, 0.0])
-    about_axis = rng.uniform(-np.pi, np.pi, count)[:, None]
-    spin = Rotation.from_rotvec(about_axis * [0.0, 0.0, 1.0])
-    about = rng.uniform(-np.pi, np.pi, count)
-    angle = np.radians(view.tilt) * np.sqrt(rng.random(count)) * 0.95
-    lean = np.column_stack([np.cos(about), np.sin(about), 0.0 * about])
-    turn = Rotation.from_rotvec(angle[:, None] * lean) * spin * facing
-    shift = centre - turn.apply(np.tile(middle, (count, 1)))
-    goals = np.hstack([commands[:, :j], shift, turn.as_rotvec(degrees=True)])
-    unit = np.array([1.0 / (arm.length or 1.0)] * 3 + [np.radians(1.0)] * 3)
-    moved = towards_zero(posed, goals, low, high, 1e-2, unit)
-    return np.hstack([moved[:, :j], commands[:, j:]])
-
-
 def in_picture(arm: Chain, commands: Array, view: View) -> tuple[Array, list[str]]:
     """Commands with what the camera sees of the board, and why it is of no use."""
     sensor = cast(Board, arm.sensor)
@@ -418,19 +413,14 @@ def in_picture(arm: Chain, commands: Array, view: View) -> tuple[Array, list[str
 
 
 def towards_zero(
-    arm: Chain,
-    commands: Array,
-    low: Array,
-    high: Array,
-    limit: float,
-    unit: Array | None = None,
+    arm: Chain, commands: Array, limits: Array, limit: float, unit: Array | None = None
 ) -> Array:
-    """Commands after damped steps towards readings of zero, within the limits.
+    """Commands after damped steps towards readings of zero, within limits (J, 2).
 
     Of contacts while they are off by more than ``limit``; of poses, in ``unit`` (6,),
     roughly.
     """
-    commands, j = commands.copy(), arm.num_joints
+    commands, j, (low, high) = commands.copy(), arm.num_joints, limits.T
     poses, most = unit is not None, 0.1 if unit is None else 0.15
     # Degrees and lengths are made comparable by how far each may go.
     scale = np.minimum(high - low, 360.0)

@@ -14,10 +14,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxcal.arms.arguments import pose_matrix
+from jaxcal.arms.files.recordings import write_servos
 from jaxcal.arms.files.urdf import described, links_of
-from jaxcal.arms.files.write import fixed_joint, with_origins
+from jaxcal.arms.files.write import fixed_joint, standing_as, with_origins
 from jaxcal.arms.sensors import Board
-from jaxcal.arms.verdict import place_of
+from jaxcal.arms.verdict import of_chain, place_of
 from jaxcal.calibration import Calibration
 from jaxcal.calibration.fit import outputs_at
 from jaxcal.calibration.fit_model import fitted_again
@@ -54,7 +55,7 @@ def for_file(fit: ArmCalibration) -> Array:
     else:
         change = "the arm in it was moved as a whole"
         parameters = np.where(held, parameters, 0.0)
-        parameters = model.standing_as(fit.arm, parameters, fit.commands)
+        parameters = standing_as(model, fit.arm, parameters, fit.commands)
         file = model.calibrated(parameters)
         joints = fit.commands[:, : file.num_inputs]
         off = file.predict(joints) - fit.arm.predict(joints)
@@ -234,9 +235,9 @@ class ArmCalibration(Calibration):
     def of(self, tip: str) -> Calibration:
         """The calibration of one of several chains (``jaxcal.models.Chains``), as of an
         arm of its own, its readings in its own unit."""
-        if not hasattr(self.model, "of_chain"):
+        if not hasattr(self.model, "chains"):
             raise ValueError(f"the model must be Chains, got {self.model._kind}")
-        return dataclasses.replace(self, **self.model.of_chain(self, tip))
+        return dataclasses.replace(self, **of_chain(self.model, self, tip))
 
     def to_urdf(self, path: AnyPath, *, force: bool = False) -> str:
         """Write the arm's own file, corrected; returns the tip link.
@@ -283,8 +284,8 @@ class ArmCalibration(Calibration):
         held = tuple(name for name in plain.names if name not in fitted)
         fixed = tuple(dict.fromkeys((*prior.fixed, *held)))
         again = fitted_again(self, plain, dataclasses.replace(prior, fixed=fixed))
-        steps: dict[str, int] = plain.write_servos(
-            path, again.parameters, servos, names or {}, force=force
+        steps = write_servos(
+            plain, path, again.parameters, servos, names or {}, force=force
         )
         if again.noise_std is not None:
             verdict: Any = again.verdict

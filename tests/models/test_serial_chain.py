@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxcal.arms.files.write import standing_as
 from jaxcal.models import Pose, Position, SerialChain, Socket, from_dict
 
 from .arms import UR5_TABLE, differences, ur5, ur5_data
@@ -337,6 +338,6 @@ def test_an_arm_whose_joint_follows_another_stands_as_one_elsewhere():
     base = np.eye(4)
     base[:3, 3] = 10.0, -20.0, 5.0
     there = SerialChain.from_dh(table, drive=arm.drive, base=base)
-    moved = arm.standing_as(there, arm.nominal, np.zeros((1, 2)))
+    moved = standing_as(arm, there, arm.nominal, np.zeros((1, 2)))
     at = arm.names.index("base x")
     np.testing.assert_allclose(moved[at : at + 3], base[:3, 3], atol=1e-9)

@@ -54,11 +54,15 @@ def read_urdf(
     text = pathlib.Path(path).read_bytes().decode("utf-8", "surrogateescape")
     try:
         chain = list(walk(text, base, tip, locked))
-        source: dict[str, object] = {"text": text, "locked": dict(locked)}
         (first, down), (last, ends_down) = chain[0], chain[-1]
-        source["base"] = first.parent if down else first.child
-        source["tip"] = last.child if ends_down else last.parent
-        return table_of(chain, joints_of(text), locked, source)
+        return described(
+            {
+                "text": text,
+                "locked": dict(locked),
+                "base": first.parent if down else first.child,
+                "tip": last.child if ends_down else last.parent,
+            }
+        )
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 
@@ -104,17 +108,6 @@ def walk(
         raise ValueError(f"no movable joint between base {base!r} and tip {tip!r}")
     yield from ((joint, False) for joint in up)
     yield from ((joint, True) for joint in reversed(down))
-
-
-def moved(joint: Joint, value: float) -> Array:
-    """(4, 4) of a joint at a value in degrees or metres; fixed ones do not move."""
-    matrix = np.eye(4)
-    if joint.kind == "R":
-        turn = Rotation.from_rotvec(value * joint.axis, degrees=True)
-        matrix[:3, :3] = turn.as_matrix()
-    elif joint.kind == "P":
-        matrix[:3, 3] = value * joint.axis
-    return matrix
 
 
 def _up(link: str, above: dict[str, Joint]) -> list[Joint]:
@@ -241,6 +234,11 @@ def led(
 ) -> tuple[str | None, float, float]:
     """The joint whose command moves this one, None where it stands still; how far; its
     value at zero in degrees and metres."""
+    if joint.kind not in ("R", "P", ""):
+        raise ValueError(
+            f"type of joint {joint.name} must be one of {', '.join(_KINDS)}, "
+            f"got {joint.kind!r}"
+        )
     times, plus, unit = 1.0, 0.0, _unit(joint)
     followed = [joint.name]
     while joint.name not in locked:
@@ -266,46 +264,62 @@ def _unit(joint: Joint) -> float:
     return float(np.radians(1.0)) if joint.kind == "R" else 1.0
 
 
+class Part(NamedTuple):
+    """A joint on the way, what moves it, and its transform without that."""
+
+    joint: Joint
+    down: bool
+    leader: str | None  # the joint whose command moves it, None where it stands still
+    times: float
+    plus: float
+
+    @property
+    def stands(self) -> Array:
+        """(4, 4) of a joint that is held somewhere, in degrees or metres."""
+        matrix, way = np.eye(4), self.plus * self.joint.axis
+        if self.joint.kind == "R" and self.leader is None:
+            matrix[:3, :3] = Rotation.from_rotvec(way, degrees=True).as_matrix()
+        elif self.joint.kind == "P" and self.leader is None:
+            matrix[:3, 3] = way
+        return matrix
+
+    @property
+    def matrix(self) -> Array:
+        whole = self.joint.origin @ self.stands
+        return np.asarray(whole if self.down else np.linalg.inv(whole))
+
+
+def parts_of(source: Mapping[str, Any]) -> list[Part]:
+    """The joints of an arm's file from its base to its tip."""
+    joints, locked = joints_of(source["text"]), source["locked"]
+    chain = walk(source["text"], source["base"], source["tip"], locked)
+    return [Part(joint, down, *led(joint, joints, locked)) for joint, down in chain]
+
+
 def described(source: Mapping[str, Any]) -> dict[str, Any]:
     """``table_of`` an arm's file, of its base and tip as they are there."""
-    text, locked = source["text"], source["locked"]
-    chain = list(walk(text, source["base"], source["tip"], locked))
-    return table_of(chain, joints_of(text), locked, dict(source))
-
-
-def table_of(
-    chain: list[tuple[Joint, bool]],
-    joints: dict[str, Joint],
-    locked: Mapping[str, float],
-    source: dict[str, object],
-) -> dict[str, Any]:
-    frame = np.eye(4)
-    lines, kinds, leads = [], [], []
-    for joint, down in chain:
-        if joint.kind not in ("R", "P", ""):
-            raise ValueError(
-                f"type of joint {joint.name} must be one of {', '.join(_KINDS)}, "
-                f"got {joint.kind!r}"
-            )
-        lead = led(joint, joints, locked)
-        if down:
-            frame = frame @ joint.origin
-        if lead[0] is None:
-            stands = moved(joint, lead[2])
-            frame = frame @ (stands if down else np.linalg.inv(stands))
-        else:
-            axis = frame[:3, :3] @ joint.axis
-            lines.append((axis if down else -axis, frame[:3, 3]))
-            kinds.append(joint.kind)
-            leads.append(lead)
-        if not down:
-            frame = frame @ np.linalg.inv(joint.origin)
-    if not lines:
+    parts = parts_of(source)
+    if not any(part.leader for part in parts):
         raise ValueError(
             f"no movable joint between base {source['base']!r} and tip "
             f"{source['tip']!r}"
         )
-    leaders, times, plus = zip(*leads, strict=True)
+    return table_of(parts, joints_of(source["text"])) | {"source": dict(source)}
+
+
+def table_of(parts: list[Part], joints: Mapping[str, Joint]) -> dict[str, Any]:
+    frame = np.eye(4)
+    lines = []
+    for part in parts:
+        if part.down:
+            frame = frame @ part.matrix
+        if part.leader:
+            axis = frame[:3, :3] @ part.joint.axis
+            lines.append((axis if part.down else -axis, frame[:3, 3]))
+        if not part.down:
+            frame = frame @ part.matrix
+    driven = [part for part in parts if part.leader]
+    _, _, leaders, times, plus = zip(*driven, strict=True)
     columns = list(dict.fromkeys(leaders))
     drive = np.equal.outer(leaders, columns) * np.array(times)[:, None]
     limits = [np.array(joints[c].limits) / _unit(joints[c]) for c in columns]
@@ -317,14 +331,13 @@ def table_of(
         reached = reached @ row_matrix(rows[-1])
     return {
         "table": np.array([*rows, np.zeros(5)]),
-        "joints": "".join(kinds),
+        "joints": "".join(part.joint.kind for part in driven),
         "joint_names": tuple(columns),
         "base": base,
         "tool": np.linalg.inv(reached) @ frame,
         "drive": drive,
         "offset": np.array(plus),
         "limits": np.array(limits),
-        "source": source,
     }
 
 
@@ -348,7 +361,7 @@ def read_ur_kinematics(path: AnyPath) -> dict[str, Any]:
             poses[key] = {}
         elif poses and key in ("x", "y", "z", "roll", "pitch", "yaw"):
             poses[[*poses][-1]][key] = float(value)
-    chain = []
+    parts = []
     for link, name in UR.items():
         if len(poses.get(link, ())) != 6:
             raise ValueError(
@@ -361,9 +374,8 @@ def read_ur_kinematics(path: AnyPath) -> dict[str, Any]:
         origin[:3, 3] = [pose[axis] for axis in "xyz"]
         axis, ends = np.array([0.0, 0.0, 1.0]), (-2.0 * np.pi, 2.0 * np.pi)
         joint = Joint(name, "R", "", link, origin, axis, None, ends)
-        chain.append((joint, True))
-    joints = {joint.name: joint for joint, _ in chain}
-    return table_of(chain, joints, {}, {}) | {"source": None}
+        parts.append(Part(joint, True, name, 1.0, 0.0))
+    return table_of(parts, {part.joint.name: part.joint for part in parts})
 
 
 def turn_of_z(axis: Array) -> Array:

@@ -10,7 +10,7 @@ import functools
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
@@ -22,15 +22,13 @@ from jaxcal.arms.arguments import pose_matrix
 from jaxcal.arms.arm import Arm
 from jaxcal.arms.files.urdf import (
     UR,
-    Joint,
+    Part,
     described,
     joints_of,
-    led,
     links_of,
-    moved,
+    parts_of,
     row_matrix,
     turn_of_z,
-    walk,
 )
 from jaxcal.arms.sensors.sensor import BASE
 from jaxcal.checks import Array, one_of
@@ -47,24 +45,16 @@ _AGREE = 1e-9  # metres and radians: the same correction
 _POSTURES = 500  # that show where an arm stands
 
 
-class _Part(NamedTuple):
-    """A transform on the way that does not move."""
-
-    joint: Joint
-    down: bool
-    stands: Array  # (4, 4) of a joint that is held somewhere
-    drives: bool  # the origin of a joint that moves
-
-    @property
-    def matrix(self) -> Array:
-        whole = self.joint.origin @ self.stands
-        return np.asarray(whole if self.down else np.linalg.inv(whole))
-
-
 def write(
-    arm: Chain, form: str, path: AnyPath, parameters: ArrayLike, *, force: bool = False
+    model: Chain | Chains,
+    form: str,
+    path: AnyPath,
+    parameters: ArrayLike,
+    *,
+    force: bool = False,
 ) -> str:
-    """Write the arm with ``parameters`` as a file that robots read.
+    """Write the arm with ``parameters`` as a file that robots read; of ``Chains`` the
+    URDF file that all came from, every chain corrected.
 
     Args:
         form: "urdf" is the file that the arm came from, its origins corrected: all else
@@ -76,45 +66,32 @@ def write(
         parameters: (p,) as ``identify`` found them.
 
     Returns:
-        Of "urdf" the tip link, a new one where no fixed joint before it could hold the
-            tool; else "".
+        Of "urdf" the tip link (several with a comma between), a new one where no fixed
+            joint before it could hold the tool; else "".
 
     Raises:
         ValueError: the arm is not of the form; a gear ratio, compliance or harmonics
             were found, which none can hold.
         FileExistsError: there is a file and ``force`` is not given.
     """
-    theta = as_parameters(arm, parameters)
-    ratios, yields, waves = arm._drives(theta)
-    lost = [f"gear{i + 1} is {ratios[i]:.6g}" for i in np.flatnonzero(ratios != 1.0)]
-    lost += [f"compliance{arm.compliance[i]}" for i in np.flatnonzero(yields)]
-    bent = np.flatnonzero(waves.any(axis=1))
-    lost += [f"harmonics of joint {arm.harmonics[i]}" for i in bent]
-    if lost:
-        raise ValueError(f"{', '.join(lost)}, which this file format cannot hold")
-    one_of("form", form, ("urdf", "dh", "ur"))
-    calibrated, tip = arm.calibrated(theta), ""
+    theta, pairs, tips = as_parameters(model, parameters), [], [""]
+    arms = getattr(model, "chains", (model,))
+    members = getattr(model, "members", (slice(None),))
+    for arm, of_arm in zip(arms, members, strict=True):
+        ratios, yields, waves = arm._drives(theta[of_arm])
+        at = np.flatnonzero(ratios != 1.0)
+        lost = [f"gear{i + 1} is {ratios[i]:.6g}" for i in at]
+        lost += [f"compliance{arm.compliance[i]}" for i in np.flatnonzero(yields)]
+        bent = np.flatnonzero(waves.any(axis=1))
+        lost += [f"harmonics of joint {arm.harmonics[i]}" for i in bent]
+        if lost:
+            raise ValueError(f"{', '.join(lost)}, which this file format cannot hold")
+        pairs.append((arm, arm.calibrated(theta[of_arm])))
+    one_of("form", form, ("urdf", "dh", "ur") if len(arms) == 1 else ("urdf",))
     if form == "urdf":
-        text, (tip,) = urdf_text([(arm, calibrated)])
+        text, tips = urdf_text(pairs)
     else:
-        text = _dh_text(calibrated) if form == "dh" else _ur_text(arm, calibrated)
-    write_over(path, text, force)
-    return tip
-
-
-def write_chains(
-    model: Chains,
-    form: str,
-    path: AnyPath,
-    parameters: ArrayLike,
-    *,
-    force: bool = False,
-) -> str:
-    """Write the URDF file that all chains came from, every chain corrected; the tip
-    links, with a comma between."""
-    one_of("form", form, ("urdf",))
-    calibrated = model.calibrated(parameters).chains
-    text, tips = urdf_text([*zip(model.chains, calibrated, strict=True)])
+        text = _dh_text(pairs[0][1]) if form == "dh" else _ur_text(*pairs[0])
     write_over(path, text, force)
     return ", ".join(tips)
 
@@ -208,8 +185,8 @@ def _moved_by(arm: Arm) -> tuple[list[str], list[str]]:
     """The joints' names, of columns that move them by one, and how others move."""
     names: list[str] = []
     others = []
-    for i, row in enumerate(arm.drive):
-        by = {arm.joint_names[k]: row[k] for k in np.flatnonzero(row)}
+    for i in range(len(arm.joints)):
+        by = arm._driven_by(i)
         if list(by.values()) == [1.0] and not set(by) & set(names):
             names += by
             continue
@@ -235,11 +212,12 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
         raise ValueError(f"{follows}, which this file cannot hold")
     if nominal.source is not None:
         gaps, steps = _steps(nominal, calibrated)
-        parts = [part for gap in gaps for part in gap if part.drives]
+        parts = [part for gap in gaps for part in gap if part.leader]
         # The file's joints turn about z: each frame is turned so that its axis is z.
         turns = [np.eye(4) for _ in parts]
-        for turn, (joint, down, _, _) in zip(turns, parts, strict=True):
-            turn[:3, :3] = turn_of_z(joint.axis if down else -joint.axis)
+        for turn, part in zip(turns, parts, strict=True):
+            axis = part.joint.axis
+            turn[:3, :3] = turn_of_z(axis if part.down else -axis)
         steps[0] = _product(gaps[0][-1:])  # what is before it is the base
         both = zip([np.eye(4), *turns], steps, turns, strict=False)
         frames = [np.linalg.inv(before) @ step @ turn for before, step, turn in both]
@@ -258,9 +236,16 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
     return "\n".join([*lines, "  hash: calibrated_by_jaxcal", ""])
 
 
-def _steps(nominal: Arm, calibrated: Arm) -> tuple[list[list[_Part]], list[Array]]:
+def _steps(nominal: Arm, calibrated: Arm) -> tuple[list[list[Part]], list[Array]]:
     """The gaps of the file, and what each of them is as calibrated, (4, 4)."""
-    gaps = _gaps(nominal.source or {})
+    # What stands still before the first moving joint, between them, after the last.
+    gaps: list[list[Part]] = [[]]
+    for part in parts_of(nominal.source or {}):
+        if part.leader and not part.down:
+            gaps.append([])
+        gaps[-1].append(part)
+        if part.leader and part.down:
+            gaps.append([])
     # The nominal base may be where a tracker sees it, and not the file's.
     base = described(nominal.source or {})["base"]
     rows = [row_matrix(row) for row in nominal.table]
@@ -290,7 +275,7 @@ def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | N
                 f"base {base!r} moves with its joint and cannot be "
                 "corrected: choose or add a link fixed to it as base"
             )
-        driving = [k for k, part in enumerate(gap) if part.drives]
+        driving = [k for k, part in enumerate(gap) if part.leader]
         at = driving[-1] if driving else len(gap) - 1
         before, after = _product(gap[:at]), _product(gap[at + 1 :])
         part, held = gap[at], np.linalg.inv(before) @ matrix @ np.linalg.inv(after)
@@ -299,23 +284,7 @@ def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | N
     return origins, extra
 
 
-def _gaps(source: Mapping[str, Any]) -> list[list[_Part]]:
-    """What stands still before the first moving joint, between them, after the last."""
-    joints, locked = joints_of(source["text"]), source["locked"]
-    gaps: list[list[_Part]] = [[]]
-    for joint, down in walk(source["text"], source["base"], source["tip"], locked):
-        leader, _, plus = led(joint, joints, locked)
-        stands = np.eye(4) if leader else moved(joint, plus)
-        part = _Part(joint, down, stands, leader is not None)
-        if part.drives and not down:
-            gaps.append([])
-        gaps[-1].append(part)
-        if part.drives and down:
-            gaps.append([])
-    return gaps
-
-
-def _product(gap: list[_Part]) -> Array:
+def _product(gap: list[Part]) -> Array:
     return functools.reduce(np.matmul, [part.matrix for part in gap], np.eye(4))
 
 

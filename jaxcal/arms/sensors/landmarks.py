@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxcal.arms.sensors.sensor import BASE, Located, Reading, Sensor, Tip, hats, label
 from jaxcal.checks import Array, Indices, array_of, numbers, whole_number
-from jaxcal.models.model import Quantity
+from jaxcal.models.model import Quantity, Rows
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,6 +64,19 @@ class Landmarks(Sensor):
 
     def unseen(self, arm: Any) -> tuple[str, ...]:
         return BASE
+
+    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
+        """Each where the nominal postures (and lengths) of its rows have it."""
+        if self.places is not None or (measured is None and not self.zeros):
+            return self, None
+        which = self.of_rows(inputs)
+        rows = [np.flatnonzero(which == i) for i in range(self.count)]
+        places = [self.place(i, at, tip, measured) for i, at in enumerate(rows)]
+        return dataclasses.replace(self, places=np.array(places)), None
+
+    def place(self, i: int, rows: Rows, tip: Tip, measured: Array | None) -> Array:
+        """(width,) where number ``i`` stands, of its rows (K,)."""
+        raise NotImplementedError
 
     def of_rows(self, inputs: Array) -> Indices:
         if self.count == 1:
@@ -131,17 +144,10 @@ class Socket(Landmarks):
         values = tip.position - parameters.reshape(-1, 3)[which]
         return Reading(values, by_tip, self.spread(which, by_one))
 
-    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
-        """Sockets in the middle of the nominal contacts."""
-        if self.places is not None:
-            return self, None
-        which, points = self.of_rows(inputs), tip.position
-        middle = points.mean(axis=0)
-        places = [
-            points[which == i].mean(axis=0) if (which == i).any() else middle
-            for i in range(self.count)
-        ]
-        return dataclasses.replace(self, places=np.array(places)), None
+    def place(self, i: int, rows: Rows, tip: Tip, measured: Array | None) -> Array:
+        """The middle of its nominal contacts, or of all."""
+        points = tip.position[rows] if rows.size else tip.position
+        return np.asarray(points.mean(axis=0))
 
     def lacking(self, inputs: Array) -> tuple[int, ...]:
         named = {int(i) for pair in self.distances for i in pair[:2]}
@@ -191,8 +197,7 @@ class Plane(Landmarks):
 
     @property
     def nominal(self) -> Array:
-        offsets = self._rows()[:, 3]
-        return np.column_stack([0.0 * offsets, 0.0 * offsets, offsets]).ravel()
+        return (self._rows()[:, 3:] * [0.0, 0.0, 1.0]).ravel()
 
     def _rows(self) -> Array:
         if self.places is None:
@@ -225,20 +230,15 @@ class Plane(Landmarks):
         along = unit[:, None] @ across
         return unit, (across - unit[..., None] * along) / size[..., None]
 
-    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
-        """Planes through the nominal points of touch."""
-        if self.places is not None:
-            return self, None
-        which, rows = self.of_rows(inputs), self._rows()
-        for i in range(self.count):
-            points = tip.position[which == i]
-            if len(points) < self.needed:
-                continue
-            middle = points.mean(axis=0)
-            normal = np.linalg.svd(points - middle)[2][-1]
-            normal = normal * (np.sign(normal[np.abs(normal).argmax()]) or 1.0)
-            rows[i] = [*normal, normal @ middle]
-        return dataclasses.replace(self, places=rows), None
+    def place(self, i: int, rows: Rows, tip: Tip, measured: Array | None) -> Array:
+        """Through its nominal points of touch."""
+        points = tip.position[rows]
+        if len(points) < self.needed:
+            return self._rows()[i]
+        middle = points.mean(axis=0)
+        normal = np.linalg.svd(points - middle)[2][-1]
+        normal = normal * (np.sign(normal[np.abs(normal).argmax()]) or 1.0)
+        return np.append(normal, normal @ middle)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -307,8 +307,8 @@ class Distance(Landmarks):
         by_one = np.hstack([-unit, -np.ones_like(far)])[:, None]
         return Reading(far - places[:, 3:], by_tip, self.spread(which, by_one))
 
-    def located(self, tip: Tip, inputs: Array, measured: Array | None) -> Located:
-        """Anchors nearest to nominal points and lengths, from linear starts.
+    def place(self, i: int, rows: Rows, tip: Tip, measured: Array | None) -> Array:
+        """The anchor nearest to nominal points and lengths, from linear starts.
 
         One is linear in the anchor and its square; of one that is far the lengths are.
         The zero too, where lengths fit three times as well with another one (twice from
@@ -316,48 +316,40 @@ class Distance(Landmarks):
         """
         from scipy import optimize
 
-        if self.places is not None or measured is None:
-            return self, None
-        which, places = self.of_rows(inputs), np.zeros((self.count, 4))
-        for i in range(self.count):
-            points, far = tip.position[which == i], measured[which == i, 0]
-            if len(points) < self.needed:
-                raise ValueError(
-                    f"places are missing: anchor {i} has {len(points)} lengths, four "
-                    "are needed to find it"
-                )
-            middle = points.mean(axis=0)
-            points = points - middle
-            rows = np.column_stack([points, np.full(len(points), 0.5), far])
-            square = ((points**2).sum(axis=1) - far**2) / 2.0
-            both = np.column_stack([square, -far])
-            near, along = np.linalg.lstsq(rows[:, :4], both, rcond=1e-6)[0][:3].T
-            size = float(np.linalg.norm(along)) or 1.0
-            loose = np.linalg.lstsq(rows, square, rcond=1e-6)[0][[0, 1, 2, 4]]
+        points, far = tip.position[rows], np.asarray(measured)[rows, 0]
+        if len(points) < self.needed:
+            raise ValueError(
+                f"places are missing: anchor {i} has {len(points)} lengths, four are "
+                "needed to find it"
+            )
+        middle = points.mean(axis=0)
+        points = points - middle
+        table = np.column_stack([points, np.full(len(points), 0.5), far])
+        square = ((points**2).sum(axis=1) - far**2) / 2.0
+        both = np.column_stack([square, -far])
+        near, along = np.linalg.lstsq(table[:, :4], both, rcond=1e-6)[0][:3].T
+        size = float(np.linalg.norm(along)) or 1.0
+        loose = np.linalg.lstsq(table, square, rcond=1e-6)[0][[0, 1, 2, 4]]
 
-            def apart(at: Array, p: Array = points, r: Array = far) -> Array:
-                gaps = np.linalg.norm(p - at[:3], axis=1) - r - at[3:].sum()
-                return np.asarray(gaps, dtype=float)
+        def apart(at: Array) -> Array:
+            gaps = np.linalg.norm(points - at[:3], axis=1) - far - at[3:].sum()
+            return np.asarray(gaps, dtype=float)
 
-            def fit(*starts: Array) -> Array:
-                fits = [
-                    optimize.least_squares(apart, one, method="lm") for one in starts
-                ]
-                return min(fits, key=lambda one: one.cost).x
+        def fit(*starts: Array) -> Array:
+            fits = [optimize.least_squares(apart, one, method="lm") for one in starts]
+            return np.asarray(min(fits, key=lambda one: one.cost).x)
 
-            starts = near, along / size * far.mean()
-            best = fit(*starts)
-            loose = fit(loose, *(np.append(one, 0.0) for one in (*starts, best)))
-            off, other = (np.median(np.abs(apart(at))) for at in (best, loose))
-            better = min(off / (2.0 if len(points) > 29 else 3.0), 0.02 * tip.length)
-            if other < better and len(points) > 10:
-                best, off = loose, other
-            anchor, zero = best[:3], best[3:].sum()
-            if off > 0.2 * tip.length:
-                raise ValueError(
-                    f"lengths to anchor {i} do not fit by {off:.3g}: measured must be "
-                    f"in the unit of the arm, whose length is {tip.length:.3g}, and "
-                    "commands in degrees"
-                )
-            places[i] = *(anchor + middle), zero
-        return dataclasses.replace(self, places=places), None
+        starts = near, along / size * far.mean()
+        best = fit(*starts)
+        loose = fit(loose, *(np.append(one, 0.0) for one in (*starts, best)))
+        off, other = (np.median(np.abs(apart(at))) for at in (best, loose))
+        better = min(off / (2.0 if len(points) > 29 else 3.0), 0.02 * tip.length)
+        if other < better and len(points) > 10:
+            best, off = loose, other
+        if off > 0.2 * tip.length:
+            raise ValueError(
+                f"lengths to anchor {i} do not fit by {off:.3g}: measured must be in "
+                f"the unit of the arm, whose length is {tip.length:.3g}, and commands "
+                "in degrees"
+            )
+        return np.append(best[:3] + middle, best[3:].sum())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -101,6 +101,20 @@ class Reading(NamedTuple):
     values: Array  # (N, q)
     by_tip: Array  # (N, q, 6) by a shift of the tip, and by its turn in radians
     by_own: Array  # (N, q, s) by the sensor's own parameters
+
+
+def facts_of(
+    members: Iterable[tuple[Sensor, Any]], parameters: Array
+) -> tuple[Array, Array]:
+    """``Sensor.facts`` of sensors whose parameters are at places among (p,): (F,) off,
+    (F, p) derivative."""
+    offs, rows = [np.zeros(0)], [np.zeros((0, len(parameters)))]
+    for sensor, at in members:
+        off, slopes = sensor.facts(parameters[at])
+        offs.append(off)
+        rows.append(np.zeros((len(off), len(parameters))))
+        rows[-1][:, at] = slopes
+    return np.concatenate(offs), np.concatenate(rows)
 
 
 # A sensor where it stands, and where its tool is seen from the nominal one (4, 4), if

@@ -21,7 +21,7 @@ from jaxcal.arms.sensors.sensor import (
     turns,
 )
 from jaxcal.checks import Array, array_of
-from jaxcal.models.model import Quantity, Rows
+from jaxcal.models.model import Model, Quantity, Rows
 from jaxcal.tables import COMMANDS, of_frame
 
 
@@ -154,30 +154,28 @@ class Several(Sensor):
         return shift, turn @ np.asarray(self.mounts)[i - 1, :3, :3], axes
 
     def read(self, tip: Tip, inputs: Array, parameters: Array) -> Reading:
-        count, q, first = len(inputs), len(self.outputs), 0
+        count, q = len(inputs), len(self.outputs)
         values = np.zeros((count, q))
         by_tip, by_own = np.zeros((count, q, 6)), np.zeros((count, q, len(parameters)))
         for i, one, rows, columns in self.parts(inputs):
-            size = len(self._axes(i))
-            last = first + size + len(one.names)
-            mount, width = parameters[first : first + size], len(one.outputs)
-            reading = one.read(
-                self._tip(i, tip, rows, mount), columns, parameters[first + size : last]
-            )
+            own, width = self.own_of_members[i], len(one.outputs)
+            mounted = slice(own.start - len(self._axes(i)), own.start)
+            mount = parameters[mounted]
+            place = self._tip(i, tip, rows, mount)
+            reading = one.read(place, columns, parameters[own])
             scale = one.stds(tip.length)[:, None]
             values[rows, :width] = reading.values / scale[:, 0]
             scaled = reading.by_tip / scale
-            by_own[rows, :width, first + size : last] = reading.by_own / scale
-            if size:
+            by_own[rows, :width, own] = reading.by_own / scale
+            if mount.size:
                 shift, _, axes = self._mount(i, mount)
                 rotation = tip.rotation[rows]
                 moves, turned = scaled[..., :3] @ rotation, scaled[..., 3:] @ rotation
                 slopes = np.concatenate([moves, np.radians(turned @ axes)], axis=-1)
                 at = [AXES.index(axis) for axis in one.tool]
-                by_own[rows, :width, first : first + size] = slopes[..., at]
+                by_own[rows, :width, mounted] = slopes[..., at]
                 scaled[..., 3:] -= scaled[..., :3] @ hats(rotation @ shift)
             by_tip[rows, :width] = scaled
-            first = last
         return Reading(values, by_tip, by_own)
 
     def wrapped(self, off: Array, inputs: Array, length: float) -> Array:
@@ -229,15 +227,6 @@ class Several(Sensor):
             at = self._tip(i, tip, rows, self._mounting(i))
             yield Readings(one, at, columns, read, rows, scale)
 
-    def facts(self, parameters: Array) -> tuple[Array, Array]:
-        offs, rows = [], []
-        for one, at in zip(self.sensors, self.own_of_members, strict=True):
-            off, slopes = one.facts(parameters[at])
-            offs.append(off)
-            rows.append(np.zeros((len(off), len(parameters))))
-            rows[-1][:, at] = slopes
-        return np.concatenate(offs), np.concatenate(rows)
-
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Self:
         from jaxcal.arms.sensors import SENSORS  # which names this class
@@ -262,11 +251,12 @@ class OneTable(NamedTuple):
 
 
 def stacked(
-    tables: Iterable[OneTable], label: int, inputs: Sequence[str], n: int, q: int
+    model: Model, label: int, tables: Iterable[OneTable]
 ) -> tuple[Array, Array]:
     """Commands (N, n) and readings (N, q) in noise of all tables, one after another;
-    ``label`` is the column of their numbers, ``inputs`` (n,) names, if any."""
+    ``label`` is the column of their numbers."""
     all_commands, all_measured = [], []
+    inputs, n, q = model.inputs, model.num_inputs, model.num_outputs
     for name, number, columns, noise, given, readings in tables:
         what = f"commands of {name}"
         if inputs:
