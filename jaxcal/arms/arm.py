@@ -136,7 +136,9 @@ class Arm:
         table = row * len(self.joints)
         return (*table, *driven, *mounting, *tool, *self.sensor.units, *waves)
 
-    def quantities_of(self, sensor: Sensor, measured_unit: str) -> tuple[Quantity, ...]:
+    def _quantities_of(
+        self, sensor: Sensor, measured_unit: str
+    ) -> tuple[Quantity, ...]:
         """What one of its sensors reads, "length" where the unit of that is unknown."""
         first, *others = sensor.quantities
         if not others and first.points == 1 and not self.sensor.joined:
@@ -153,7 +155,7 @@ class Arm:
         others = ("deg", "rad", "m/s", "g", "N", "p", "times")
         return of_file if measured_unit.startswith(others) else measured_unit or of_file
 
-    def own(self, i: int) -> slice:
+    def _own(self, i: int) -> slice:
         """Where what the sensor's member ``i`` has of its own is among the p."""
         at, before = self.sensor.own_of_members[i], self._at["sensor"].start
         return slice(before + at.start, before + at.stop)
@@ -165,7 +167,7 @@ class Arm:
         for i, part in enumerate(self.sensor.of_members(tip, inputs, measured)):
             kind = part.sensor.kind
             kind = f"sensor {i}'s {kind}" if kinds.count(kind) > 1 else kind
-            yield part._replace(member=i, kind=kind, own=self.own(i))
+            yield part._replace(member=i, kind=kind, own=self._own(i))
 
     def skeleton(self, commands: ArrayLike) -> Array:
         """(N, n + 2, 3) the base, each joint's origin and the tip, to be drawn."""

@@ -40,16 +40,13 @@ class SerialChain(Arm, Model):
 
     A row of the table is ``Rz(theta + u) Tz(d) Tx(a) Rx(alpha) Ry(beta)`` in the
     standard convention and ``Tx(a) Rx(alpha) Ry(beta) Rz(theta + u) Tz(d)`` in the
-    modified one (a and alpha of the link before the joint). beta is zero in a DH table:
-    between parallel axes the other four cannot describe a small misalignment by small
-    numbers (Hayati).
+    modified one (a and alpha of the link before the joint). beta is zero in a DH table.
 
-    Parameters, in this order: ``a1 alpha1 d1 theta1 beta1 a2 ...``; ``gear1 ...`` and
-    ``compliance1 ...`` of those asked for; ``base x`` to ``rz``; what the sensor sees
-    of ``tool x`` to ``rz``; the sensor's own; ``theta1 sin``, ``cos``, ``sin2``,
-    ``cos2`` ... of the harmonics asked for. The turns of base and tool are relative to
-    their nominal rotation. Commands are the joints, then the columns that the sensor
-    asks for.
+    Parameters, as docs/arms.md explains them, in this order: ``a1 alpha1 d1 theta1
+    beta1 a2 ...``; gears and compliance; ``base x`` to ``rz``; what the sensor sees of
+    ``tool x`` to ``rz``; the sensor's own; harmonics. The turns of base and tool are
+    relative to their nominal rotation. Commands are the joints, then the columns that
+    the sensor asks for.
     """
 
     # Of modules that know this one.
@@ -106,9 +103,8 @@ class SerialChain(Arm, Model):
                 ("compliance2"): degrees per unit of weight times length. By default all
                 for contacts, else none.
             yields: (C,) nominal compliance of these joints.
-            harmonics: revolute joints, from 1, with eccentric gears: they move by sin
-                and cos of their angle, and of twice it, besides.
-            waves: (H, 4) these in degrees, nominally.
+            harmonics: revolute joints, from 1, with eccentric gears; nominally (H, 4)
+                ``waves`` in degrees, by sin and cos of their angle, and of twice it.
             loads: (link, weight, centre in the frame of that row); by default a weight
                 of one at the end of every link but the first, the last at the tool.
             gravity: direction of weight in the measuring frame; times 9.81 where
@@ -224,7 +220,7 @@ class SerialChain(Arm, Model):
         """This arm with another sensor."""
         return dataclasses.replace(self, sensor=sensor)
 
-    def with_member(self, i: int, sensor: Sensor) -> Self:
+    def _with_member(self, i: int, sensor: Sensor) -> Self:
         """This arm with another sensor in the place of its member ``i``."""
         members = [*self.sensor.members]
         members[i] = sensor
@@ -234,7 +230,7 @@ class SerialChain(Arm, Model):
         """This arm with harmonics of its joints: what the parameters do not explain."""
         return self._bent
 
-    def with_effects(
+    def _with_effects(
         self,
         *,
         compliance: Sequence[int] = (),
@@ -258,7 +254,7 @@ class SerialChain(Arm, Model):
     def _bent(self) -> Self:  # kept, and what it keeps with it
         if self.harmonics or "R" not in self.joints:
             return self
-        return self.with_effects(harmonics=turning(self.joints))
+        return self._with_effects(harmonics=turning(self.joints))
 
     def calibrated(self, parameters: ArrayLike, sensor: Sensor | None = None) -> Self:
         """The arm whose nominal is this one with ``parameters`` (p,), with a
@@ -327,7 +323,7 @@ class SerialChain(Arm, Model):
         return tuple("deg" if kind == "R" else "length" for kind in kinds)
 
     def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
-        return self.quantities_of(self.sensor, measured_unit)
+        return self._quantities_of(self.sensor, measured_unit)
 
     def predict(self, commands: ArrayLike, parameters: Theta = None) -> Array:
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)

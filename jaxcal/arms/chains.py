@@ -32,14 +32,11 @@ class Chains(Model):
     """Chains by the names of their tips; shared parameters occur once.
 
     Chains that begin with the same joints (a torso's) share their columns, and the
-    parameters of the links between. A sensor that is given to several chains as one
-    object, by itself or in ``Several``, is one: both arms touch the same sockets, found
-    from the arm that reads them most. All else is each chain's own, ``left: a3``.
-
-    Commands are the columns of all joints, 0 where they are not of the row's chain;
-    ``chain``, which says of each row whose tip was read, from 0; and the sensors'
-    columns. Readings are in units of their sensor's noise, as ``together`` makes them;
-    ``Calibration.of(tip)`` is what was found of one chain, in its own units.
+    parameters of the links between; a sensor that is given to several chains as one
+    object is one, found from the arm that reads it most. All else is each chain's own,
+    ``left: a3``. Commands are the columns of all joints, 0 where they are not of the
+    row's chain; ``chain``, whose tip was read, from 0; and the sensors' columns.
+    Readings are in units of their sensor's noise, as ``together`` makes them.
 
     Attributes:
         tips: names of the chains, two or more.
@@ -178,10 +175,10 @@ class Chains(Model):
             for i, number in enumerate(self.stands[k]):
                 (first, at), *others = self._members[number]
                 if others:
-                    names = self.chains[first].names[self.chains[first].own(at)]
+                    names = self.chains[first].names[self.chains[first]._own(at)]
                     everywhere = len(others) == len(self.chains) - 1
                     of_first = "" if everywhere else f"{self.tips[first]}: "
-                    of_arm[arm.own(i)] = [of_first + name for name in names]
+                    of_arm[arm._own(i)] = [of_first + name for name in names]
             named.append(of_arm)
         return named
 
@@ -228,7 +225,7 @@ class Chains(Model):
             members[i] = sensors[self.stands[k][i]]
         return arm.measured_with(arm.sensor.with_members(members)) if mine else arm
 
-    def with_member(self, number: int, sensor: Sensor) -> Self:
+    def _with_member(self, number: int, sensor: Sensor) -> Self:
         """These chains with another sensor in the place of ``number``."""
         chains = [self._with({number: sensor}, a, k) for k, a in enumerate(self.chains)]
         return dataclasses.replace(self, chains=tuple(chains))

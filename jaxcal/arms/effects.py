@@ -166,7 +166,7 @@ def _alternatives(model: Chain) -> Iterator[tuple[str, Chain, Prior]]:
         ("compliance", "harmonics"),
         ("compliance", "gears", "harmonics"),
     ):
-        other = model.with_effects(**{name: more[name] for name in names})
+        other = model._with_effects(**{name: more[name] for name in names})
         prior = other.default_prior()
         std = np.array(prior.std, dtype=np.float64)
         of_row = [_LENGTHS, _TURNS, _LENGTHS, _ZEROS, _TURNS]

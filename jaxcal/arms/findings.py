@@ -67,16 +67,14 @@ def findings_of(
     parts: list[Readings],
     scatter: Reason | None,
     mistaken: str,
-    anywhere: float,
-    nominal: float,
+    vague: Reason | None,
     more: bool,
 ) -> tuple[tuple[str, ...], bool, str]:
     """What is wrong, by name, of the rows ``used`` (K,); whether nothing is that casts
     doubt on readings or description; what to do about a calibration that is not good.
 
-    ``scatter`` is what the noise does not explain, ``mistaken`` what was said of
-    columns, ``anywhere`` the tip's standard deviation, ``nominal`` its error as
-    described; ``more`` measurements may help.
+    ``scatter``, ``mistaken`` (columns) and ``vague`` (the arm left open) are what was
+    seen already; ``more`` measurements may help.
     """
     model = fit.model
     swapped: dict[int, int] = {}
@@ -112,7 +110,6 @@ def findings_of(
     ]
     doubtful |= wrong or unused or mistaken != ""
     doubtful |= bool(contradicting or exchanged or other_arm)
-    vague = left_open(parts, unit_after(fit), anywhere, nominal)
     reasons += [vague.fact] if vague else []
     residuals = scatter.remedy if scatter else LOOK
     steps = (
@@ -282,7 +279,7 @@ def _freed(fit: Fit, part: Readings, row: int) -> tuple[float, float]:
     sensor: Any = part.sensor
     distances = sensor.distances
     rest = [one for one, kept in zip(distances, touched, strict=True) if kept]
-    free = model.with_member(part.member, dataclasses.replace(sensor, distances=rest))
+    free = model._with_member(part.member, dataclasses.replace(sensor, distances=rest))
     again = fitted_again(fit, free, stated_prior(fit))
     _, _, distance, std = distances[row]
     if again.covariance is None:  # too few readings to tell the noise without it

@@ -67,7 +67,7 @@ class ArmFitting(Fitting):
 
     def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
         arm = self.model
-        of_each = [arm.quantities_of(s, measured_unit) for s in arm.sensor.members]
+        of_each = [arm._quantities_of(s, measured_unit) for s in arm.sensor.members]
         return tuple(
             dict.fromkeys(q.unit for quantities in of_each for q in quantities)
         )
@@ -78,7 +78,7 @@ class ArmFitting(Fitting):
 
     def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
         members = enumerate(self.model.sensor.members)
-        at = [(sensor, self.model.own(i)) for i, sensor in members]
+        at = [(sensor, self.model._own(i)) for i, sensor in members]
         return facts_of(at, as_parameters(self.model, parameters))
 
     def log_size(self, commands: Array, parameters: Array) -> Array | None:
@@ -196,7 +196,7 @@ class ChainsFitting(Fitting):
         at = []
         for (k, i), *_ in self.model._members:  # a distance is known once
             arm = self.model.chains[k]
-            at.append((arm.sensor.members[i], self.model.members[k][arm.own(i)]))
+            at.append((arm.sensor.members[i], self.model.members[k][arm._own(i)]))
         return facts_of(at, as_parameters(self.model, parameters))
 
     def error_groups(self) -> ErrorGroups:

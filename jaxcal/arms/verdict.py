@@ -19,6 +19,7 @@ from jaxcal.arms.findings import (
     CLEAR_UP,
     LOOK,
     findings_of,
+    left_open,
     other_distances,
     parts_of,
     unit_after,
@@ -63,14 +64,8 @@ class HeldOut:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ArmVerdict(models.Verdict):
-    """What the readings say of an arm's calibration.
-
-    Good: held-out errors are below the accuracy asked for. Where none was, it is better
-    than the nominal machine, and the noise explains the scatter or a third of the
-    nominal error is left; of an accurate arm with a camera or a board, the place of
-    that is known. In each case no reading contradicts the others or the arm's
-    description, and contacts do not leave its size open.
-    """
+    """What the readings say of an arm's calibration; docs/sensors.md, "What is
+    noticed", has when it is good."""
 
     # None where there are too few measurements to tell.
     explains: bool | None = None  # the scatter of the readings is what the noise can be
@@ -138,11 +133,7 @@ def _missed(
 
 
 def verdict(model: Chain, fit: Fit) -> ArmVerdict:
-    """Does its model explain the readings, does it help, what is wrong.
-
-    Held-out errors with an interval beside those of the nominal arm, the scatter
-    against the sensor's usual noise, and by name what ``findings_of`` finds.
-    """
+    """Does its model explain the readings, does it help, what is wrong by name."""
     unit = fit.measured_unit
     usual, reason = np.asarray(model.default_noise().std), None
     if fit.noise_std is None:
@@ -180,8 +171,9 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
     if isinstance(accuracy, float):  # of a file of 0.2
         accuracy = {errors[0].unit: accuracy}
     more = accuracy is not None or helps is None
+    vague = left_open(parts, unit_after(fit), anywhere, nominal)
     reasons, clean, step = findings_of(
-        fit, used, parts, scattered, mistaken, anywhere, nominal, more
+        fit, used, parts, scattered, mistaken, vague, more
     )
     place = None
     if all(part.sensor.views for part in parts):
@@ -295,7 +287,7 @@ def _in_units(
 ) -> Iterator[HeldOut]:
     """A part's mean errors, those of each unit by themselves."""
     unit = fit.measured_unit
-    for quantity in fit.model.quantities_of(part.sensor, unit):
+    for quantity in fit.model._quantities_of(part.sensor, unit):
         of_part, of_nominal = (
             quantity.size(errors[part.rows, : len(part.scale)] * part.scale)
             for errors in (held_out, off)
@@ -448,7 +440,7 @@ def _shared_parts(
         part = readings[0]._replace(
             member=number,
             kind=readings[0].sensor.kind,
-            own=model.members[k][model.chains[k].own(i)],
+            own=model.members[k][model.chains[k]._own(i)],
             rows=used,
             columns=np.vstack([of_chain.columns for of_chain in readings]),
         )

@@ -127,7 +127,7 @@ def static_transform(
         one_of("measured_unit, for a transform in metres,", unit, [*_METRES])
     ]
     tool = [f"tool {axis}" for axis in sensor.tool]
-    owns = [model.names[model.own(i)] for i in range(len(sensors))]
+    owns = [model.names[model._own(i)] for i in range(len(sensors))]
     fitted = {*tool, *(name for own in owns for name in own)}
     held = tuple(name for name in model.names if name not in fitted)
     again = fitted_again(fit, model, Prior(model.default_prior().std, fixed=held))
@@ -177,10 +177,6 @@ def to_transform(
             link and its fixed joint.
         child, parent, camera: as of ``static_transform``.
         force: write over a file that is there.
-
-    Raises:
-        ValueError: as of ``static_transform``; .urdf of an arm of no file.
-        FileExistsError: there is a file and ``force`` is not given.
     """
     form = os.path.splitext(os.fspath(path))[1].lower()
     one_of("ending of the file", form, _FORMS)
@@ -271,10 +267,8 @@ class ArmCalibration(Calibration):
         error. Do not also use a corrected URDF file: it would apply the zeros twice.
 
         Args:
-            path: the file to write.
             servos: the file that the postures were read with.
             names: motors not named as the joints: {"Rotation": "shoulder_pan"}.
-            force: overwrite an existing file.
         """
         plain = self.model.writable()
         zeros = [name for name in plain.names if name.startswith("theta")]

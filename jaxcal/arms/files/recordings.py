@@ -46,11 +46,6 @@ def recorded(arm: Chain, recording: Recording) -> tuple[Array, Array | None]:
 
     Readings are zeros of contacts and of poses of a board, which stand in the commands,
     and None where no message holds them (corners' pixels) or of a LeRobot dataset.
-
-    Raises:
-        ValueError: the arm never stood still, ``which`` does not fit, or there are no
-            readings.
-        MissingExtraError: what reads it is not installed.
     """
     sensor = arm.sensor
     views = sensor.views and sensor.zeros
@@ -413,12 +408,8 @@ def write_servos(
     *,
     force: bool = False,
 ) -> dict[str, int]:
-    """Write LeRobot's calibration file with the joints' zeros of ``parameters`` (p,).
-
-    Of turning joints alone. ``servos`` is the file that is corrected, ``names`` are
-    motors whose names differ from the joints'. Returns the steps by which the middle of
-    each motor's range moved.
-    """
+    """Write LeRobot's calibration file with the turning joints' zeros of ``parameters``
+    (p,); arguments and what returns as of ``ArmCalibration.to_lerobot``."""
     theta = as_parameters(arm, parameters)
     zeros = (theta - arm.nominal)[: arm.table.size].reshape(arm.table.shape)[:, 3]
     ahead = {}

@@ -6,6 +6,7 @@ arm gets the same five parameters a joint, whatever frames its file uses.
 
 from __future__ import annotations
 
+import functools
 import os
 import pathlib
 from collections.abc import Iterator, Mapping
@@ -140,11 +141,13 @@ def _robot(text: str) -> ElementTree.Element:
     return robot
 
 
-def links_of(text: str) -> list[str]:
-    return [_name(link, "link") for link in _robot(text).findall("link")]
+@functools.lru_cache(4)
+def links_of(text: str) -> tuple[str, ...]:
+    return tuple(_name(link, "link") for link in _robot(text).findall("link"))
 
 
-def joints_of(text: str) -> dict[str, Joint]:
+@functools.lru_cache(4)
+def joints_of(text: str) -> Mapping[str, Joint]:
     """The joints of a file by name."""
     links, joints = links_of(text), {}
     for element in _robot(text).findall("joint"):
@@ -230,7 +233,7 @@ def _read_joint(element: ElementTree.Element) -> Joint:
 
 
 def led(
-    joint: Joint, joints: dict[str, Joint], locked: Mapping[str, float]
+    joint: Joint, joints: Mapping[str, Joint], locked: Mapping[str, float]
 ) -> tuple[str | None, float, float]:
     """The joint whose command moves this one, None where it stands still; how far; its
     value at zero in degrees and metres."""

@@ -57,17 +57,14 @@ def write(
     URDF file that all came from, every chain corrected.
 
     Args:
-        form: "urdf" is the file that the arm came from, its origins corrected: all else
-            stays as it is, and the tip goes where ``predict`` of positions puts it, the
-            base in the measuring frame included. "dh" is the table as CSV: joint, a,
-            alpha, d, theta (with the joint's offset), beta, without base, tool and
-            convention; a warning names joints that follow others. "ur" is the YAML file
-            of Universal Robots' ROS description, for six joints, without base and tool.
+        form: "urdf" is the file that the arm came from, its origins corrected, base in
+            the measuring frame included. "dh" is the table as CSV, without base, tool
+            and convention; a warning names joints that follow others. "ur" is the YAML
+            file of Universal Robots' ROS description, without base and tool.
         parameters: (p,) as ``identify`` found them.
 
     Returns:
-        Of "urdf" the tip link (several with a comma between), a new one where no fixed
-            joint before it could hold the tool; else "".
+        Of "urdf" the tip links, a new one where no fixed joint could hold the tool.
 
     Raises:
         ValueError: the arm is not of the form; a gear ratio, compliance or harmonics
@@ -119,13 +116,7 @@ def standing_as(arm: Chain, other: Any, parameters: Array, commands: Array) -> A
 
 
 def urdf_text(chains: Sequence[tuple[Arm, Arm]]) -> tuple[str, list[str]]:
-    """The file of nominal chains with the origins of calibrated ones, and its tips.
-
-    A tip is a new link where no fixed joint of the file could hold the tool.
-
-    Raises:
-        ValueError: a chain is of no URDF file, or what was found cannot be in one.
-    """
+    """The file of nominal chains with the origins of calibrated ones, and its tips."""
     source = chains[0][0].source
     if any(nominal.source is None for nominal, _ in chains) or source is None:
         raise ValueError("the arm must come from a URDF file: SerialChain.from_urdf")
