@@ -46,9 +46,13 @@ def axis_letter(index: int, count: int) -> str:
     return "xyz"[index] if count == 3 else str(index + 1)
 
 
-def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
+def require_unmasked(name: str, values: Any) -> None:
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise ValueError(f"{name} must not be masked; leave the masked rows out")
+
+
+def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
+    require_unmasked(name, values)
     try:
         raw = np.asarray(values)
         if raw.dtype.kind not in "biufO":

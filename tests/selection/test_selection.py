@@ -378,6 +378,16 @@ def test_whitened_rows_are_orthonormal_over_the_available():
     assert problem.blocks.shape == (20, 1, 4) and problem.multiplicity == 3
 
 
+@pytest.mark.parametrize("name", ["available", "max_replicates", "required"])
+def test_a_masked_value_is_no_value(name):
+    """numpy's mask says that nothing is known of row 9, not that it may be chosen."""
+    values = np.ma.array(np.arange(10) if name == "required" else np.ones(10, int))
+    values[9] = np.ma.masked
+    x = np.random.default_rng(0).normal(size=(10, 2))
+    with pytest.raises(ValueError, match=f"{name} must not be masked"):
+        jaxcal.select(x, 3, **{name: values})
+
+
 def test_a_masked_candidate_may_be_nan():
     candidates = uniform(0)
     available = np.arange(20) != 7

@@ -19,6 +19,7 @@ from jaxcal.checks import (
     require_kind,
     require_none,
     require_size,
+    require_unmasked,
     whole_number,
 )
 from jaxcal.models.linear import Affine
@@ -149,7 +150,7 @@ class CandidateSet:
     def _check_counts(self, max_replicates: ArrayLike, constraints: Any) -> None:
         """How often a candidate may be chosen, a number or (M,), and in all."""
         self.constraints = checked_constraints(constraints, len(self.available))
-        caps = one_array("replicates", max_replicates)
+        caps = one_array("max_replicates", max_replicates)
         if caps.ndim == 0:
             self.max_replicates = whole_number("max_replicates", caps[()], 1)
             return
@@ -422,6 +423,7 @@ def check_available(available: ArrayLike | None, shape: tuple[int, ...]) -> Mask
 
 def one_array(name: str, values: ArrayLike) -> NDArray[np.generic]:
     """A copy of ``values`` as an array of any kind."""
+    require_unmasked(name, values)
     try:
         return np.array(values)
     except ValueError as error:
