@@ -41,12 +41,12 @@ from jaxcal.commands.train_configuration import teacher
 from jaxcal.extras import versions
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.information.regression import log_det_information
+from jaxcal.learning.config import NetworkConfig
 from jaxcal.learning.environments import selection
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import scorer
 from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.features import CandidateFeatures, DecisionFeatures
-from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training import presets

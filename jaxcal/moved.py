@@ -23,6 +23,7 @@ MOVED = {  # longer names first
     "jaxcal.learning.environments.brax_env": "jaxcal.learning.brax",
     "jaxcal.learning.environments.randomness": "jaxcal.learning.environments.selection",
     "jaxcal.learning.policies.geometry": "jaxcal.learning.policies.features",
+    "jaxcal.learning.policies.networks": "jaxcal.learning.core.network",
     "jaxcal.learning.runtime.cache": "jaxcal.learning.runtime.processes",
     "jaxcal.learning.environments.scenarios": "jaxcal.learning.environments.selection",
     "jaxcal.learning.settings": "jaxcal.learning.config",

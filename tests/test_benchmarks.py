@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxcal.learning.config import NetworkConfig
 from jaxcal.learning.core import network as networks
+from jaxcal.learning.core.network import build
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies.networks import NetworkConfig, build
 
 CONFIG = SelectionConfig()
 ACTIONS = np.array([[3, 17, 49, 8], [0, 1, 2, 40]])

@@ -85,7 +85,7 @@ def ours(which: str, sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
 
 def brax(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     """``python train.py --trainer brax``: brax's own PPO, the network 64 wide."""
-    from jaxcal.learning.policies.networks import build
+    from jaxcal.learning.core.network import build
     from jaxcal.learning.runtime import processes
     from jaxcal.learning.training import brax_ppo, presets
     from jaxcal.learning.training import postures as training

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxcal.learning.brax import SelectionEnv, brax_networks, repaired, wrap_fresh
-    from jaxcal.learning.config import EpisodesConfig, StreamsConfig
+    from jaxcal.learning.config import EpisodesConfig, NetworkConfig, StreamsConfig
     from jaxcal.learning.core.network import Network, mask_logits
     from jaxcal.learning.core.postures import Episode, Postures
     from jaxcal.learning.core.ppo import Learner
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
         step,
     )
     from jaxcal.learning.environments.task import Task
-    from jaxcal.learning.policies.networks import NetworkConfig
     from jaxcal.learning.training.presets import TrainConfig
     from jaxcal.learning.training.presets import load as preset
 
@@ -63,7 +62,7 @@ __all__ = [
 
 _HOME = {
     "brax": ("SelectionEnv", "brax_networks", "repaired", "wrap_fresh"),
-    "config": ("EpisodesConfig", "StreamsConfig"),
+    "config": ("EpisodesConfig", "NetworkConfig", "StreamsConfig"),
     "core.network": ("Network", "mask_logits"),
     "core.postures": ("Episode", "Postures"),
     "core.ppo": ("Learner",),
@@ -73,7 +72,6 @@ _HOME = {
         *("SelectionConfig", "SelectionState", "observe", "reset", "start", "step"),
     ),
     "environments.task": ("Task",),
-    "policies.networks": ("NetworkConfig",),
     "training.presets": ("TrainConfig", "preset"),
 }
 

@@ -1,6 +1,9 @@
-"""Hyperparameters: of PPO, how much an update plays, sizes of an episode.
+"""Hyperparameters: of PPO, how much an update plays, sizes of an episode, networks.
 
-Fields have a default, a line of help and checks. Nothing here loads JAX.
+Fields have a default, a line of help and checks. Nothing here loads JAX. A network of
+one's own is a ``core.network.Network``, or its name: ``module:Name`` or
+``file.py:Name``; it has a ``NetworkConfig`` if it has a field ``config``. An installed
+package adds a kind by an entry point in the group ``jaxcal.networks``.
 """
 
 from __future__ import annotations
@@ -14,9 +17,12 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
+from jaxcal.extras import installed
+
 SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform")
 """Shapes of a cloud of candidates, see ``environments.selection.mixture``."""
 
+NETWORKS = "jaxcal.networks"  # entry points: kinds of network
 _OWN = "jaxcal.own "  # before the path of a file, in the name of its module
 
 
@@ -265,3 +271,42 @@ class SelectionConfig:
     def observation_size(self) -> int:
         """Length of the paper's observation: 210 for 50 candidates, 3 inputs."""
         return (self.num_inputs + 1) * self.num_candidates + 2 * self.num_inputs + 4
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Which network, and its size."""
+
+    kind: str = setting(
+        "compact", "compact, paper, observation, MODULE:NAME or FILE.py:NAME"
+    )
+    width: int = setting(32, "features per candidate; for paper, hidden width")
+    encoder_rounds: int = setting(3, "message rounds over the whole set, for each set")
+    decoder_rounds: int = setting(
+        1, "message rounds over the remaining candidates, for each decision"
+    )
+    lookahead: int = setting(12, "largest number of greedy choices ahead in a feature")
+    close_up: bool = setting(False, "features that separate near-equal look-aheads")
+    initial_trust: float = setting(
+        0.0, "initial weight of the look-ahead; with 4 training starts at its rule"
+    )
+    initial_actor: float = setting(0.1, "scale of the learned score at the start")
+    mirrored: bool = setting(
+        False, "for observation: choose by the mean over a set's mirror images"
+    )
+
+    def __post_init__(self) -> None:
+        kind: Any = self.kind
+        if isinstance(kind, type):
+            object.__setattr__(self, "kind", path_of(kind))
+        installs = self.kind != "compact" and ":" not in self.kind
+        if installs and self.kind not in installed(NETWORKS):
+            kinds = ", ".join(["compact", *installed(NETWORKS)])
+            raise ValueError(
+                f"kind must be one of {kinds}, got {self.kind!r}; name your own as "
+                "MODULE:NAME or FILE.py:NAME, or as an entry point in the group "
+                f"{NETWORKS}"
+            )
+        require(self, "at least 1", lambda v: v >= 1, "width", "lookahead")
+        rounds = ("encoder_rounds", "decoder_rounds")
+        require(self, "0 or more", lambda v: v >= 0, *rounds)

@@ -8,9 +8,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from jaxcal.learning.config import NetworkConfig
 from jaxcal.learning.core.network import Network, Scores, mask_logits
 from jaxcal.learning.environments.selection import context_features
-from jaxcal.learning.policies.networks import NetworkConfig
 
 HEADS = ("actor", "critic_1", "critic_2")  # everything else is shared
 

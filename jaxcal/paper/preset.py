@@ -7,9 +7,8 @@ rate, clip range or entropy bonus. Adam at 1e-4, 0.2 and 0.01 are the usual ones
 
 from __future__ import annotations
 
-from jaxcal.learning.config import EpisodesConfig
+from jaxcal.learning.config import EpisodesConfig, NetworkConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training.presets import TrainConfig
 
 PAPER = TrainConfig(

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcal.learning.config import NetworkConfig
 from jaxcal.learning.core.network import Scores, mask_logits
-from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.paper.network import Decision, Observing
 
 _STATE = 64  # numbers that the chosen postures become

@@ -22,10 +22,10 @@ from jaxcal.learning.runtime import devices
 from jaxcal.learning.core import ppo, postures
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.core.postures import Postures
-from jaxcal.learning.policies.networks import build
+from jaxcal.learning.core.network import build
 from jaxcal.learning.training import presets, run as training
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.config import NetworkConfig
 from jaxcal.learning.environments.task import Task
 out = {}
 

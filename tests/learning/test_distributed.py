@@ -302,7 +302,7 @@ from jaxcal.learning.runtime import devices, processes
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.config import NetworkConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.training.presets import TrainConfig
 

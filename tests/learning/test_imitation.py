@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcal.learning.config import EpisodesConfig
+from jaxcal.learning.config import EpisodesConfig, NetworkConfig
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.core import ppo
+from jaxcal.learning.core.network import build
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.training import postures as imitation
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.presets import TrainConfig

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxcal.learning.config import NetworkConfig
 from jaxcal.learning.core import network as networks
-from jaxcal.learning.core.network import Network, initial
+from jaxcal.learning.core.network import Network, build, initial
 from jaxcal.learning.policies import scorer
-from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.training import checkpoint
 from jaxcal.paper.network import HEADS
 

@@ -17,13 +17,13 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxcal.learning
-from jaxcal.learning.config import EpisodesConfig, StreamsConfig
+from jaxcal.learning.config import EpisodesConfig, NetworkConfig, StreamsConfig
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.core import ppo
+from jaxcal.learning.core.network import build
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.run import Recipe, run, updates
 from jaxcal.selection import exact_batch

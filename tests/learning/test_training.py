@@ -22,11 +22,11 @@ import pytest
 
 from jaxcal.commands import train as command
 from jaxcal.commands import train_configuration
-from jaxcal.learning.config import EpisodesConfig, named
+from jaxcal.learning.config import EpisodesConfig, NetworkConfig, named
+from jaxcal.learning.core.network import build
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import GivenCandidates, Task
 from jaxcal.learning.policies.compact import CompactNetwork
-from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint, presets, run
 from jaxcal.learning.training import postures as training
@@ -523,7 +523,7 @@ def test_an_unknown_network_or_preset_is_named():
 def test_learning_finds_the_papers_network_without_importing_the_paper():
     code = (
         "import sys\n"
-        "from jaxcal.learning.policies.networks import build\n"
+        "from jaxcal.learning.core.network import build\n"
         "from jaxcal.learning.training import presets\n"
         "assert not any(name.startswith('jaxcal.paper') for name in sys.modules)\n"
         "print(type(build(presets.load('paper').network)).__module__)"

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.learning.core.network import decode, encode, initial
+from jaxcal.learning.config import NetworkConfig
+from jaxcal.learning.core.network import build, decode, encode, initial
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments import selection
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies import scorer
-from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.training import checkpoint
 from jaxcal.paper.preset import OBSERVATION
 

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from jaxcal.extras import MissingExtraError
+from jaxcal.learning.config import NetworkConfig
+from jaxcal.learning.core.network import build
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import scorer
-from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.policy import select_batch

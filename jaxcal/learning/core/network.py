@@ -7,6 +7,7 @@ inputs, K choices; leading axes ``...``.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -14,11 +15,15 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from jaxcal.extras import installed
+from jaxcal.learning.config import NETWORKS, NetworkConfig, named
+
 Scores = tuple[jax.Array, jax.Array]
 """(..., M) masked logits and (...,) value."""
 
 _OWN = "a Network of one's own defines this"
 _LAST = "a Network with num_unlearned > 0 defines this"
+_COMPACT = "jaxcal.learning.policies.compact:CompactNetwork"
 _LEAST = -1e9  # logit of what is not available
 
 
@@ -75,6 +80,17 @@ class Network(nn.Module):
         features = self.candidate_features(candidates, available)
         decision = self.decision_features(features, chosen, available, 0)
         return self.decode(self.encode(features), decision)
+
+
+def build(config: NetworkConfig) -> Network:
+    """The network that a configuration names: ``compact``, one's own, a package's."""
+    path = _COMPACT if config.kind == "compact" else config.kind
+    kind: Any = named(path) if ":" in path else installed(NETWORKS)[path].load()
+    if not (isinstance(kind, type) and issubclass(kind, Network)):
+        raise ValueError(f"kind must be a Network, got {config.kind}")
+    fields = [field.name for field in dataclasses.fields(kind)]
+    arguments: dict[str, Any] = {"config": config} if "config" in fields else {}
+    return kind(**arguments)
 
 
 def initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:

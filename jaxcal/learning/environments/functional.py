@@ -19,9 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxcal.learning.config import NetworkConfig
+from jaxcal.learning.core.network import build
 from jaxcal.learning.environments import selection
 from jaxcal.learning.environments.selection import CandidateSource, SelectionConfig
-from jaxcal.learning.policies.networks import NetworkConfig, build
 
 _LARGEST = float(np.finfo(np.float32).max)
 

@@ -8,6 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from jaxcal.learning.config import NetworkConfig
 from jaxcal.learning.core.network import Network, Scores, mask_logits
 from jaxcal.learning.policies.features import (
     CandidateFeatures,
@@ -18,7 +19,6 @@ from jaxcal.learning.policies.features import (
     vector_features,
     whiten,
 )
-from jaxcal.learning.policies.networks import NetworkConfig
 
 _SHARP = 60.0  # inverse temperature of the choices that need no learning
 

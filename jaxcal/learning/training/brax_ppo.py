@@ -14,9 +14,8 @@ from typing import Any
 import jax
 
 from jaxcal.learning import brax
-from jaxcal.learning.config import settings_of
+from jaxcal.learning.config import NetworkConfig, settings_of
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.run import locked

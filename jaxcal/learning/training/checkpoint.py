@@ -26,9 +26,9 @@ import orbax.checkpoint as ocp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from jaxcal.extras import versions
-from jaxcal.learning.core.network import Network, initial
+from jaxcal.learning.config import NetworkConfig
+from jaxcal.learning.core.network import Network, build, initial
 from jaxcal.learning.core.ppo import TrainState
-from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import CheckpointError, Weights
 

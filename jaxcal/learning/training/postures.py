@@ -25,6 +25,7 @@ from flax import struct
 
 from jaxcal.learning.core.network import (
     Network,
+    build,
     decode,
     encode,
     log_softmax,
@@ -33,7 +34,6 @@ from jaxcal.learning.core.network import (
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.core.ppo import Learner, Metrics, TrainState
 from jaxcal.learning.policies import scorer
-from jaxcal.learning.policies.networks import build
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.presets import TrainConfig
 from jaxcal.learning.training.run import Recipe, run

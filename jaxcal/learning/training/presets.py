@@ -10,6 +10,7 @@ from jaxcal.extras import installed
 from jaxcal.learning.config import (
     SHAPES,
     EpisodesConfig,
+    NetworkConfig,
     RunConfig,
     SelectionConfig,
     require,
@@ -17,7 +18,6 @@ from jaxcal.learning.config import (
     settings_of,
 )
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.networks import NetworkConfig
 
 if TYPE_CHECKING:
     from jaxcal.learning.core.postures import Postures
@@ -52,8 +52,8 @@ class TrainConfig(RunConfig):
 
     @property
     def learners(self) -> tuple[Postures, ...]:
+        from jaxcal.learning.core.network import build
         from jaxcal.learning.core.postures import Postures
-        from jaxcal.learning.policies.networks import build
 
         network = build(dataclasses.replace(self.network, mirrored=False))
         return tuple(Postures(self.ppo, task, network) for task in self.tasks)
