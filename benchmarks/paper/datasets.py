@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import hashlib
 import importlib.metadata
+import io
 import json
+import os
 import pathlib
 import platform
 import sys
@@ -16,8 +19,9 @@ import numpy as np
 
 from benchmarks.paper.twin import HOLD_S, RobotConfig, simulate
 from jaxcal.arguments import Parser, exit_code, several, values_of
-from jaxcal.evaluation.dataset import Dataset, save_csv, save_npz
-from jaxcal.files import require_writable_folder, write_text
+from jaxcal.checks import axis_letter
+from jaxcal.evaluation.dataset import LABELS, MASK, Dataset, save_npz
+from jaxcal.files import atomic_write, require_writable_folder, write_text
 from jaxcal.paper.datasets import (
     AXES,
     BIAS_DEG,
@@ -34,7 +38,7 @@ from jaxcal.paper.datasets import (
 from jaxcal.paper.datasets import make_dataset as drawn_or_recorded
 from jaxcal.progress import Progress
 
-__all__ = ["dataset0_robot", "main", "make_dataset", "write_datasets"]
+__all__ = ["dataset0_robot", "main", "make_dataset", "save_csv", "write_datasets"]
 
 _PROGRAM = "python -m benchmarks.paper.datasets"
 _DESCRIPTION = """\
@@ -138,6 +142,33 @@ def write_datasets(
         written += [*files, card]
     report.clear()
     return written
+
+
+def save_csv(
+    dataset: Dataset,
+    path: str | os.PathLike[str],
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> None:
+    """Write a .csv atomically, every number with all its digits; ranges are not kept.
+    ``progress`` is told how many episodes of how many are written."""
+    n, m, mask = dataset.num_inputs, dataset.num_outputs, dataset.available
+    header = [*LABELS, *(f"u_{axis_letter(i, n)}" for i in range(n))]
+    values = [dataset.candidates]
+    if dataset.measured is not None:
+        header += [f"y_{axis_letter(i, m)}" for i in range(m)]
+        values.append(dataset.measured)
+    header += [] if mask is None else [MASK]
+    with atomic_write(path) as file:
+        text = io.TextIOWrapper(file, "utf-8", newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(header)
+        for e, episode in enumerate(zip(*values, strict=True)):
+            if e % 1000 == 0:
+                progress(f"write {os.path.basename(path)}", e, dataset.num_episodes)
+            for i, row in enumerate(np.concatenate(episode, axis=1).tolist()):
+                last = [] if mask is None else [int(mask[e, i])]
+                writer.writerow([e, i, *row, *last])
+        text.detach()
 
 
 def _card(

@@ -1,6 +1,6 @@
 """How close each way of choosing postures comes to the proven optimum."""
 
-from jaxcal.evaluation.dataset import Dataset, load_dataset, save_csv, save_npz
+from jaxcal.evaluation.dataset import Dataset, load_dataset, save_npz
 from jaxcal.evaluation.methods import PostureEvaluation, evaluate
 from jaxcal.evaluation.report import Evaluation, Summary, text_table
 
@@ -11,7 +11,6 @@ __all__ = [
     "Summary",
     "evaluate",
     "load_dataset",
-    "save_csv",
     "save_npz",
     "text_table",
 ]

@@ -8,27 +8,25 @@ optionally ``y_...`` and ``available``.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
 import io
 import os
 import pathlib
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
-from jaxcal.checks import Array, Mask, array_of, axis_letter, require_none
+from jaxcal.checks import Array, Mask, array_of, require_none
 from jaxcal.files import atomic_write
 from jaxcal.tables import COMMANDS, MEASURED, Table, parse
 
 _KEYS = ("candidates", "measured", "available")
 _ENDS = ("low", "high")
-_LABELS = ("episode", "candidate")
-_MASK = "available"
+LABELS = ("episode", "candidate")
+MASK = "available"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -162,33 +160,6 @@ def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[Any]:
     return member
 
 
-def save_csv(
-    dataset: Dataset,
-    path: str | os.PathLike[str],
-    progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> None:
-    """Write a .csv atomically, every number with all its digits; ranges are not kept.
-    ``progress`` is told how many episodes of how many are written."""
-    n, m, mask = dataset.num_inputs, dataset.num_outputs, dataset.available
-    header = [*_LABELS, *(f"u_{axis_letter(i, n)}" for i in range(n))]
-    values = [dataset.candidates]
-    if dataset.measured is not None:
-        header += [f"y_{axis_letter(i, m)}" for i in range(m)]
-        values.append(dataset.measured)
-    header += [] if mask is None else [_MASK]
-    with atomic_write(path) as file:
-        text = io.TextIOWrapper(file, "utf-8", newline="")
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(header)
-        for e, episode in enumerate(zip(*values, strict=True)):
-            if e % 1000 == 0:
-                progress(f"write {os.path.basename(path)}", e, dataset.num_episodes)
-            for i, row in enumerate(np.concatenate(episode, axis=1).tolist()):
-                last = [] if mask is None else [int(mask[e, i])]
-                writer.writerow([e, i, *row, *last])
-        text.detach()
-
-
 def _read_csv(source: str, data: bytes) -> dict[str, Any]:
     """The fields of a ``Dataset``; ``source`` is the file's name in errors."""
     table = parse(source, data)
@@ -225,8 +196,8 @@ def _read_csv(source: str, data: bytes) -> dict[str, Any]:
     fields: dict[str, Any] = {"candidates": in_order[..., u]}
     if y:
         fields["measured"] = in_order[..., y]
-    if _MASK in table.labels:  # 0 and 1 alone, as save_csv writes it
-        table.columns([_MASK])
+    if MASK in table.labels:  # 0 and 1 alone
+        table.columns([MASK])
     if (mask := table.available()) is not None:
         fields["available"] = mask[order].reshape(shape)
     return fields
@@ -235,7 +206,7 @@ def _read_csv(source: str, data: bytes) -> dict[str, Any]:
 def _columns(table: Table) -> list[str]:
     """All of them, the labels first."""
     source, header = table.source, table.header
-    for name in _LABELS:
+    for name in LABELS:
         if name not in header or not table.headed:
             raise ValueError(
                 f"{source}: column {name!r} is missing; columns: {', '.join(header)}"
@@ -243,6 +214,6 @@ def _columns(table: Table) -> list[str]:
     if not any(name.startswith(COMMANDS) for name in header):
         raise ValueError(f"{source}: no column of commands, such as u_x, in the header")
     for name in header:
-        if name not in (*_LABELS, _MASK) and not name.startswith((COMMANDS, MEASURED)):
+        if name not in (*LABELS, MASK) and not name.startswith((COMMANDS, MEASURED)):
             raise ValueError(f"{source}: unknown column {name!r}")
-    return [*_LABELS, *(name for name in header if name not in (*_LABELS, _MASK))]
+    return [*LABELS, *(name for name in header if name not in (*LABELS, MASK))]

@@ -18,7 +18,6 @@ from jaxcal.reports.plots import (
     BLACK,
     COLOURS,
     GREY,
-    boxes,
     legend_right,
     numbered,
     panels,
@@ -28,7 +27,6 @@ from jaxcal.tables import read_table
 if TYPE_CHECKING:
     from jaxcal.evaluation.report import MethodResult
 
-SHOWN_EPISODES = 200  # more than these points side by side cannot be told apart
 _CURVE_POINTS = 600  # draw any step curve
 _FIXED: dict[str, dict[str, Any]] = {  # the style of random and exact in every figure
     "random": {"color": GREY, "linestyle": ":", "marker": "x"},
@@ -38,41 +36,14 @@ _FIXED: dict[str, dict[str, Any]] = {  # the style of random and exact in every 
 
 def evaluation_figures(evaluation: PostureEvaluation) -> dict[str, Figure]:
     """Every figure the evaluation holds data for, by file name without suffix."""
-    drawn = [det_per_episode, det_means, det_distributions, gap_to_optimum, best_so_far]
-    return {draw.__name__: draw(evaluation) for draw in drawn}
-
-
-def det_per_episode(evaluation: PostureEvaluation) -> Figure:
-    """det S in each episode: the main method, the optimum and one random draw."""
-    figure, axes = _figure(evaluation, "det S per episode", 3.8)
-    total = evaluation.dataset.num_episodes
-    shown = min(total, SHOWN_EPISODES)
-
-    def draw(log_det: Array, label: str, **look: Any) -> None:
-        x = np.arange(1, shown + 1)
-        axes.plot(x, log_det[:shown] / np.log(10.0), label=label, **look)
-
-    random = evaluation.random_log_det[:, 0]
-    draw(random, "random, one draw", ls="none", marker="x", ms=4, color=GREY)
-    draw(evaluation.reference, _reference_name(evaluation), lw=0.8, color=BLACK)
-    # The first policy, else the first method that is neither random nor exact.
-    others = [r for r in evaluation.results if r.method not in ("random", "exact")]
-    if others:
-        main = next((r for r in others if r.is_policy), others[0])
-        look = {"ls": "none", "marker": "o", "ms": 3.5, "color": COLOURS[0]}
-        draw(main.log_det[:, 0], _label(evaluation, main), **look)
-    part = "" if shown == total else f", first {shown} of {total:,}"
-    axes.set_xlabel(f"episode{part}")
-    _det_axis(axes.yaxis, evaluation)
-    legend_right(axes)
-    return figure
+    return {draw.__name__: draw(evaluation) for draw in (det_means, gap_to_optimum)}
 
 
 def det_means(evaluation: PostureEvaluation) -> Figure:
     """Mean det S by method with its 95 % interval, and how many times random it is."""
-    results = _with_random(evaluation)
+    results = with_random(evaluation)
     height = 0.9 + 0.42 * len(results)
-    figure, axes = _figure(evaluation, "Mean det S by method", height)
+    figure, axes = titled(evaluation, "Mean det S by method", height)
     ends = []
     for row, (name, log_det, _) in enumerate(results):
         values = np.exp(log_det - log_det.max()).mean(axis=1)
@@ -87,7 +58,7 @@ def det_means(evaluation: PostureEvaluation) -> Figure:
     names, _, styles = zip(*results, strict=True)
     intervals(axes, names, ends, styles)
     axes.margins(x=0.12)
-    _det_axis(axes.xaxis, evaluation, "mean {}, with 95 % interval")
+    name_det_axis(axes.xaxis, evaluation, "mean {}, with 95 % interval")
     return figure
 
 
@@ -107,25 +78,10 @@ def intervals(
     axes.set_ylim(len(names) - 0.5, -0.7)
 
 
-def det_distributions(evaluation: PostureEvaluation) -> Figure:
-    """Distribution of det S over the selections of each method, on a log scale."""
-    names, log_dets, styles = zip(*_with_random(evaluation), strict=True)
-    height = 1.1 + 0.42 * len(names)
-    figure, axes = _figure(evaluation, "Distribution of det S", height)
-    samples = [log_det.ravel() / np.log(10.0) for log_det in log_dets]
-    colours = [style["color"] for style in styles]
-    boxes(axes, samples, colours, (5, 95), orientation="horizontal")
-    axes.set_yticks(range(1, len(names) + 1), names)
-    axes.invert_yaxis()
-    text = "{}; box: quartiles and median, whiskers: 5 to 95 %"
-    _det_axis(axes.xaxis, evaluation, text)
-    return figure
-
-
 def gap_to_optimum(evaluation: PostureEvaluation) -> Figure:
     """Share of selections that reach at least each fraction of the optimum."""
-    figure, axes = _figure(evaluation, "Gap to the optimum", 4.0)
-    for name, log_det, style in _with_random(evaluation):
+    figure, axes = titled(evaluation, "Gap to the optimum", 4.0)
+    for name, log_det, style in with_random(evaluation):
         behind = np.minimum(log_det - evaluation.reference[:, None], 0.0)
         ratio = np.exp(behind).ravel()
         # Share of selections at or above each value that occurs, ties taken together.
@@ -134,35 +90,15 @@ def gap_to_optimum(evaluation: PostureEvaluation) -> Figure:
         keep = np.unique(np.linspace(0, len(values) - 1, _CURVE_POINTS).astype(int))
         x, y = np.append(0.0, values[keep]), np.append(1.0, share[keep])
         label = f"{name} (mean {ratio.mean():.3g})"
-        axes.step(x, y, where="pre", label=label, **_line(style))
-    axes.set_xlabel(f"det S / det S* ({_reference_name(evaluation)})")
+        axes.step(x, y, where="pre", label=label, **curve_of(style))
+    axes.set_xlabel(f"det S / det S* ({reference_name(evaluation)})")
     axes.set_ylabel("share of selections at least this good")
     axes.set(xlim=(0.0, 1.005), ylim=(0.0, 1.02))
     legend_right(axes)
     return figure
 
 
-def best_so_far(evaluation: PostureEvaluation) -> Figure:
-    """Largest det S found up to each episode (paper, Figure 4); of several draws the
-    median curve, with a band from 5 to 95 % of them."""
-    figure, axes = _figure(evaluation, "Best det S so far", 3.8)
-    x = np.arange(1, evaluation.dataset.num_episodes + 1)
-    for name, log_det, style in _with_random(evaluation):
-        best = np.maximum.accumulate(log_det, axis=0) / np.log(10.0)
-        low, middle, high = np.quantile(best, [0.05, 0.5, 0.95], axis=1)
-        label, draws = name, best.shape[1]
-        if draws > 1:
-            look = {"color": style["color"], "alpha": 0.2, "lw": 0}
-            axes.fill_between(x, low, high, step="post", **look)
-            label = f"{name}, median and\n5 to 95 % of {draws} draws"
-        axes.step(x, middle, where="post", label=label, **_line(style))
-    axes.set_xlabel("episode")
-    _det_axis(axes.yaxis, evaluation, "best {} so far")
-    legend_right(axes)
-    return figure
-
-
-def _figure(
+def titled(
     evaluation: PostureEvaluation, title: str, height: float
 ) -> tuple[Figure, Any]:
     """A titled figure of one panel, and its axes; height in inches."""
@@ -173,7 +109,7 @@ def _figure(
     return figure, axes
 
 
-def _det_axis(axis: Any, evaluation: PostureEvaluation, text: str = "{}") -> None:
+def name_det_axis(axis: Any, evaluation: PostureEvaluation, text: str = "{}") -> None:
     """Name an axis that holds log10 det S, which can exceed the largest float, and
     label it with powers of ten."""
     unit = "as in the file" if evaluation.dataset.ranges is None else "in [0, 1]"
@@ -182,11 +118,11 @@ def _det_axis(axis: Any, evaluation: PostureEvaluation, text: str = "{}") -> Non
     axis.set_major_formatter(FuncFormatter(lambda x, _: f"$10^{{{x:g}}}$"))
 
 
-def _reference_name(evaluation: PostureEvaluation) -> str:
+def reference_name(evaluation: PostureEvaluation) -> str:
     return "proven optimum" if evaluation.proven.all() else "optimum or its upper bound"
 
 
-def _label(evaluation: PostureEvaluation, result: PostureResult) -> str:
+def label_of(evaluation: PostureEvaluation, result: PostureResult) -> str:
     """The method in words, with its checkpoint where there are several."""
     policies = {r.checkpoint for r in evaluation.results if r.is_policy}
     if not result.is_policy or len(policies) < 2:
@@ -201,7 +137,7 @@ def styles_of(results: Sequence[MethodResult]) -> list[dict[str, Any]]:
     return [_FIXED.get(result.method) or numbered(next(number)) for result in results]
 
 
-def _line(style: dict[str, Any]) -> dict[str, Any]:
+def curve_of(style: dict[str, Any]) -> dict[str, Any]:
     """A curve; the optimum broad and pale, for others may lie on it."""
     line = {key: style[key] for key in ("color", "linestyle")}
     if style["color"] == BLACK:
@@ -209,13 +145,13 @@ def _line(style: dict[str, Any]) -> dict[str, Any]:
     return line
 
 
-def _with_random(
+def with_random(
     evaluation: PostureEvaluation,
 ) -> list[tuple[str, Array, dict[str, Any]]]:
     """Name, (E, R) log det S and style of every method; random also when not asked."""
     results = evaluation.results
     rows = [
-        (_label(evaluation, result), result.log_det, style)
+        (label_of(evaluation, result), result.log_det, style)
         for result, style in zip(results, styles_of(results), strict=True)
     ]
     if all(result.method != "random" for result in results):

@@ -14,10 +14,11 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks.paper.datasets import save_csv
 from jaxcal.commands import evaluate as command
 from jaxcal.commands import tables
 from jaxcal.evaluation import figures
-from jaxcal.evaluation.dataset import Dataset, save_csv, save_npz
+from jaxcal.evaluation.dataset import Dataset, save_npz
 from jaxcal.information.regression import regression_matrix
 from jaxcal.paper.datasets import make_dataset
 from jaxcal.progress import Progress

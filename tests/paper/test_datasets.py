@@ -16,12 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxcal
-from benchmarks.paper.datasets import main, make_dataset
+from benchmarks.paper.datasets import main, make_dataset, save_csv
 from jaxcal.candidates import JointRanges
 from jaxcal.evaluation.dataset import (
     Dataset,
     load_dataset,
-    save_csv,
     save_npz,
 )
 from jaxcal.paper.datasets import (

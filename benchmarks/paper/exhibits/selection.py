@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.paper.exhibits import figures
 from benchmarks.paper.exhibits.exhibit import Columns, Exhibit, judge
 from benchmarks.paper.exhibits.intervals import (
     bootstrap_interval,
@@ -15,7 +16,7 @@ from benchmarks.paper.exhibits.intervals import (
     share_interval,
 )
 from benchmarks.paper.exhibits.study import Settings, Study
-from jaxcal.evaluation import figures
+from jaxcal.evaluation.figures import det_means, gap_to_optimum
 from jaxcal.evaluation.methods import HIT_TOLERANCE, PostureEvaluation
 from jaxcal.reports.plots import BLACK, COLOURS, legend_right, panels
 
@@ -123,7 +124,7 @@ def _determinants(study: Study, name: str, key: str, title: str) -> Exhibit:
         verdict=judge(times.low > 100.0 and narrower, times.high >= 100.0),
         figures={
             f"{key}a_det_per_episode": figures.det_per_episode(evaluation),
-            f"{key}b_det_means": figures.det_means(evaluation),
+            f"{key}b_det_means": det_means(evaluation),
             f"{key}c_det_distributions": figures.det_distributions(evaluation),
         },
         data=data,
@@ -149,7 +150,7 @@ def _gap(study: Study, name: str) -> Exhibit:
         {"name": name, "count": len(evaluation.reference), "proven": proven},
         figures={
             "gap_per_episode": _gap_per_episode(columns, name),
-            "gap_distribution": figures.gap_to_optimum(evaluation),
+            "gap_distribution": gap_to_optimum(evaluation),
         },
         data={"gap": columns},
         numbers=numbers,
