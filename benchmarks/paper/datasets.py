@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from benchmarks.paper.recordings import RECORDED, SHIPPED, recorded
 from benchmarks.paper.twin import HOLD_S, RobotConfig, simulate
 from jaxcal.arguments import Parser, exit_code, several, values_of
 from jaxcal.checks import axis_letter
@@ -30,12 +31,10 @@ from jaxcal.paper.datasets import (
     NOISE_STD_DEG,
     NUM_CANDIDATES,
     RANGES,
-    RECORDED,
     SCALE,
-    SHIPPED,
     streams,
 )
-from jaxcal.paper.datasets import make_dataset as drawn_or_recorded
+from jaxcal.paper.datasets import make_dataset as drawn
 from jaxcal.progress import Progress
 
 __all__ = ["dataset0_robot", "main", "make_dataset", "save_csv", "write_datasets"]
@@ -70,19 +69,22 @@ def make_dataset(
     recordings: pathlib.Path | str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Dataset:
-    """One of the paper's datasets, whole: dataset0, which is simulated, too.
+    """One of the paper's datasets, whole: the simulated and the recorded too.
 
     Args:
         name: dataset0, of which every group of postures has a random stream of its
-            own, or what ``jaxcal.paper.datasets.make_dataset`` makes.
+            own, dataset4, dataset5, or what ``jaxcal.paper.datasets`` makes.
         seed: of the streams, 0 or greater.
         episodes: the first so many; all when not given.
         recordings: folder of dataset4.csv and dataset5.csv; the shipped one when not
             given.
         progress: told how much of dataset0 is simulated.
     """
+    if name in RECORDED:
+        whole = recorded(name, seed, recordings)
+        return whole.part(0, EPISODES[name] if episodes is None else episodes)
     if name != "dataset0":
-        return drawn_or_recorded(name, seed, episodes, recordings=recordings)
+        return drawn(name, seed, episodes)
     shape = (NUM_CANDIDATES, 3)
     groups = range(EPISODES[name] if episodes is None else episodes)
     pairs = [streams(name, seed, group) for group in groups]

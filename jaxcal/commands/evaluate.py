@@ -45,8 +45,7 @@ methods:
   exact               the proven optimum
 
 datasets:
-  dataset1 to 5       the paper's, drawn with --seed (200,000, 1,000, 100, 100 and 1
-                      episodes); 4 and 5 from --recordings or the shipped ones
+  dataset1 to 3       the paper's, drawn with --seed (200,000, 1,000 and 100 episodes)
   FILE.npz            candidates (episodes, M, n); optional measured, available
   FILE.csv            episode,candidate,u_x,u_y,u_z[,y_x,y_y,y_z]
 
@@ -136,7 +135,6 @@ class EvaluateOptions(Outputs):
         tuple[str, ...], "trained policies; default the shipped one", "DIR"
     ] = ()
     dataset: Annotated[tuple[str, ...], "datasets; dataset2", "NAME|FILE"] = ()
-    recordings: Annotated[Path | None, "dataset4.csv, dataset5.csv", "DIR"] = None
     methods: Annotated[
         list[str] | None, "default: all", "A,B", several(str, "names")
     ] = None
@@ -299,7 +297,7 @@ def _dataset(name: str, options: EvaluateOptions) -> Dataset:
         from jaxcal.paper.datasets import make_dataset
 
         count = min(options.episodes or EPISODES[name], EPISODES[name])
-        return make_dataset(name, options.seed, count, recordings=options.recordings)
+        return make_dataset(name, options.seed, count)
     if Path(name).suffix.lower() not in (".npz", ".csv"):
         raise ValueError(
             f"--dataset takes {', '.join(EPISODES)}, or a .npz or .csv file, got "

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 import jaxcal
 from benchmarks.paper.datasets import main, make_dataset, save_csv
+from benchmarks.paper.recordings import RECORDED, SHIPPED, read_pool
 from jaxcal.candidates import JointRanges
 from jaxcal.evaluation.dataset import (
     Dataset,
@@ -29,11 +30,8 @@ from jaxcal.paper.datasets import (
     NAMES,
     NOISE_STD_DEG,
     RANGES,
-    RECORDED,
     SCALE,
-    SHIPPED,
     chunks,
-    read_pool,
 )
 
 # A loaded machine is no failure.
