@@ -20,6 +20,7 @@ from benchmarks.paper.exhibits.figures import (
     best_so_far,
     det_distributions,
     det_per_episode,
+    training_panels,
 )
 from jaxcal.evaluation import figures
 from jaxcal.evaluation.dataset import Dataset
@@ -471,17 +472,17 @@ def metrics(folder: pathlib.Path, updates: int = 30) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("updates", [1, 2, 30])
-def test_training_curves_have_the_papers_three_panels(
+def test_training_panels_are_the_papers_three_panels(
     tmp_path: pathlib.Path, updates: int
 ) -> None:
     metrics(tmp_path, updates)
-    figure = training_curves({"run": tmp_path})
+    figure = training_panels({"run": tmp_path})
     titles = [axes.get_title() for axes in figure.axes]
     assert titles[0].startswith("(a)") and titles[2].startswith("(c)")
     assert "updates" in titles[1]
     rewards = np.random.default_rng(0).normal(size=1500).astype(np.float32)
     np.save(tmp_path / "last_rewards.npy", rewards)
-    figure = training_curves({"run": tmp_path})
+    figure = training_panels({"run": tmp_path})
     assert "last 1,000 episodes" in figure.axes[1].get_title()
     figure.suptitle("Training of the paper's network", fontsize=10)
     assert texts_outside(figure) == []
@@ -496,9 +497,10 @@ def test_labels_of_a_long_run_are_not_cut_off(tmp_path: pathlib.Path) -> None:
     lines += [f"{500 * i},{r},0.3,0.5" for i, r in zip(u, reward, strict=True)]
     (tmp_path / "metrics.csv").write_text("\n".join(lines) + "\n")
     np.save(tmp_path / "last_rewards.npy", rng.normal(-0.25, 0.26, size=1000))
-    figure = training_curves({"run": tmp_path})
-    figure.suptitle("Training of the paper's network", fontsize=10)
-    assert texts_outside(figure) == []
+    for draw in (training_panels, training_curves):
+        figure = draw({"run": tmp_path})
+        figure.suptitle("Training of the paper's network", fontsize=10)
+        assert texts_outside(figure) == []
 
 
 @pytest.mark.parametrize(

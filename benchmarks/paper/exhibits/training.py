@@ -17,13 +17,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.paper.exhibits.exhibit import Exhibit, Verdict, judge
+from benchmarks.paper.exhibits.figures import last_rewards, training_panels
 from benchmarks.paper.exhibits.intervals import band, mean_interval
 from benchmarks.paper.exhibits.study import Study
-from jaxcal.evaluation.figures import (
-    last_rewards,
-    read_metrics,
-    training_curves,
-)
+from jaxcal.evaluation.figures import read_metrics
 from jaxcal.reports.plots import COLOURS, GREY, boxes, panels
 
 Array = NDArray[np.float64]
@@ -225,7 +222,7 @@ def _paper(runs: list[Run]) -> Exhibit:
     held, flat = run.summary, flats[0]
     took = "." if run.finished else ": not finished, so this is how far it went."
     ratios = [each.summary["dataset2"]["ratio_to_exact"] for each in runs]
-    figure = training_curves({"paper's": run.folder})
+    figure = training_panels({"paper's": run.folder})
     figure.suptitle("Training of the paper's network", fontsize=10)
     return Exhibit.from_texts(
         "figure_2_paper",
