@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -18,6 +17,7 @@ import jax
 import numpy as np
 
 from jaxcal.adaptive.loop import Loop, estimates
+from jaxcal.evaluation.report import finite
 
 _FIELDS = {"suggest": (), "observed": ("outcome", "design", "number"), "state": ()}
 
@@ -80,13 +80,8 @@ def _state(loop: Loop) -> dict[str, Any]:
     return {
         "number": int(session.made),
         "over": bool(loop.task.over(session)),
-        "seconds": _finite(session.seconds),
+        "seconds": finite(session.seconds),
         "uses": int(session.uses),
-        "entropy": _finite(belief.entropy()),
+        "entropy": finite(belief.entropy()),
         "unknowns": {name: dataclasses.asdict(unknowns[name]) for name in unknowns},
     }
-
-
-def _finite(value: Any) -> float | None:
-    """A number, or null where there is none."""
-    return float(value) if math.isfinite(value) else None

@@ -33,25 +33,23 @@ def make_mesh(
     number = have if num_devices is None else num_devices
     if not 1 <= number <= have:
         raise ValueError(f"devices must be in [1, {have}], got {num_devices}")
-    chosen: list[jax.Device] = []
-    for process in range(jax.process_count()):
-        chosen += [d for d in jax.devices() if d.process_index == process][:number]
+    processes = range(jax.process_count())
+    chosen = [d for i in processes for d in jax.local_devices(i)[:number]]
     if len(chosen) == 1:
         return None
-    shared, what = num_seeds, "--seeds"
-    if num_seeds == 1:
-        shared = rows
-        what = (
-            "episodes_per_update / (episodes_per_set x num_minibatches), or of a task "
-            "decisions_per_update / (stream_length x num_minibatches),"
-        )
+    axis, shared = ("seeds", num_seeds) if num_seeds > 1 else ("sets", rows)
     if shared % len(chosen):
         fewer = max(n for n in range(1, len(chosen)) if shared % n == 0)
+        what = {
+            "seeds": "--seeds",
+            "sets": "episodes_per_update / (episodes_per_set x num_minibatches), or of "
+            "a task decisions_per_update / (stream_length x num_minibatches),",
+        }[axis]
         raise ValueError(
             f"{what} must be a multiple of the {len(chosen)} devices, got {shared}; "
             f"use {fewer} devices (--devices {fewer})"
         )
-    return Mesh(np.asarray(chosen), ("seeds" if num_seeds > 1 else "sets",))
+    return Mesh(np.asarray(chosen), (axis,))
 
 
 def a_device_for_each_core(num_seeds: int) -> None:
@@ -67,9 +65,8 @@ def a_device_for_each_core(num_seeds: int) -> None:
 
 def describe(mesh: Mesh | None) -> str:
     """The devices in words: "cpu", "8 x NVIDIA H100 in 2 processes"."""
-    number = "" if mesh is None else f"{mesh.size} x "
-    several = jax.process_count() > 1
-    where = f" in {jax.process_count()} processes" if several else ""
+    number, processes = "" if mesh is None else f"{mesh.size} x ", jax.process_count()
+    where = f" in {processes} processes" if processes > 1 else ""
     return f"{number}{jax.devices()[0].device_kind}{where}"
 
 
@@ -90,10 +87,10 @@ def on_first(function: Callable[[], T]) -> T:
         except (ValueError, OSError) as error:
             answer = error
     data = np.frombuffer(pickle.dumps(answer), np.uint8)
+    broadcast = multihost_utils.broadcast_one_to_all
     with collective():
-        size = int(multihost_utils.broadcast_one_to_all(np.int32(data.size)))
-        buffer = data if is_first() else np.zeros(size, np.uint8)
-        data = np.asarray(multihost_utils.broadcast_one_to_all(buffer), np.uint8)
+        size = int(broadcast(np.int32(data.size)))  # of the first; others send nothing
+        data = np.asarray(broadcast(np.resize(data, size)), np.uint8)
     answer = pickle.loads(data.tobytes())
     if isinstance(answer, Exception):
         raise answer

@@ -21,7 +21,6 @@ from jaxcal.arguments import Parser, refused, values_of
 EXIT_LOST = 3  # another process of the job is gone
 HEARTBEAT_SECONDS = 20  # silence after which a process counts as lost
 _CONNECT_SECONDS = 300  # for all processes to come together
-_LEAVE_SECONDS = 3600  # for process 0 to write its files when the others are done
 _LAUNCHERS = (  # what others that JAX knows set in each process that they start
     *("JAX_COORDINATOR_ADDRESS", "MEGASCALE_COORDINATOR_ADDRESS"),
     "JOB_COMPLETION_INDEX",
@@ -48,13 +47,15 @@ def expected(job: Job, environ: Mapping[str, str] = os.environ) -> bool:
         return False
     if address is number is process_id is None:
         # A batch script has SLURM_NTASKS too, but runs outside any job step.
-        several = environ.get("SLURM_NTASKS", "1") != "1"
-        several &= "SLURM_STEP_NODELIST" in environ
-        several |= environ.get("OMPI_COMM_WORLD_SIZE", "1") != "1"
-        several |= "," in environ.get("TPU_WORKER_HOSTNAMES", "")
-        # The slice of a Cloud TPU machine is in its metadata, which only JAX reads.
-        several |= any(map(os.path.exists, ("/dev/accel0", "/dev/vfio/0")))
-        return several or any(name in environ for name in _LAUNCHERS)
+        in_step = "SLURM_STEP_NODELIST" in environ
+        return (
+            (in_step and environ.get("SLURM_NTASKS", "1") != "1")
+            or environ.get("OMPI_COMM_WORLD_SIZE", "1") != "1"
+            or "," in environ.get("TPU_WORKER_HOSTNAMES", "")
+            # The slice of a Cloud TPU machine is in its metadata, which only JAX reads.
+            or any(map(os.path.exists, ("/dev/accel0", "/dev/vfio/0")))
+            or any(name in environ for name in _LAUNCHERS)
+        )
     if address is None or number is None or process_id is None:
         raise ValueError(
             "--coordinator, --num-processes and --process-id must come together"
@@ -126,7 +127,7 @@ def _connect(job: Job) -> None:
             job.process_id,
             initialization_timeout=_CONNECT_SECONDS,
             heartbeat_timeout_seconds=HEARTBEAT_SECONDS,
-            shutdown_timeout_seconds=_LEAVE_SECONDS,
+            shutdown_timeout_seconds=3600,  # process 0 writes, the others are done
         )
     except ValueError:
         if job.num_processes is None:
