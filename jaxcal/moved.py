@@ -5,6 +5,7 @@ import sys
 from importlib.machinery import ModuleSpec
 
 MOVED = {  # longer names first
+    "jaxcal.adaptive.fit_ahead": "jaxcal.adaptive.lookahead",
     "jaxcal.adaptive.journal": "jaxcal.adaptive.loop",
     "jaxcal.adaptive.policy.features": "jaxcal.adaptive.policy.network",
     "jaxcal.adaptive.policy.sessions": "jaxcal.adaptive.policy.network",

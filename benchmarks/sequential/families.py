@@ -44,9 +44,8 @@ from benchmarks.sequential.optimum import solve
 from benchmarks.sequential.transfer import arrays, shown
 from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.evaluation import seconds_a_choice
-from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.lookahead import AHEAD, Ahead
+from jaxcal.adaptive.lookahead import AHEAD, Ahead, fit
 from jaxcal.adaptive.rules import (
     SHARES,
     Gain,

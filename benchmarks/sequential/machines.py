@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxcal.adaptive.episodes import compare
 from jaxcal.adaptive.evaluation import seconds_a_choice
-from jaxcal.adaptive.fit_ahead import fit
+from jaxcal.adaptive.lookahead import fit
 from jaxcal.adaptive.policy import training
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.rules import SHARES, Gain, StateRule

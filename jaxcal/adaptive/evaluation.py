@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
@@ -13,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.adaptive.episodes import compare
-from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.lookahead import AHEAD
+from jaxcal.adaptive.lookahead import AHEAD, fit
 from jaxcal.adaptive.policy import training as policies
 from jaxcal.adaptive.rules import (
     SHARES,
@@ -23,7 +21,6 @@ from jaxcal.adaptive.rules import (
     GainRate,
     Priced,
     Random,
-    Rule,
     StateRule,
 )
 from jaxcal.adaptive.session import jit_by_class
@@ -168,8 +165,18 @@ def evaluate(
         if rule in methods:
             rules[rule] = entry.rules.get(rule, start)
             if retune or rule not in entry.rules:
-                tell = functools.partial(progress, f"tuning {rule}")
-                rules[rule] = _tuned(task, rules[rule], seed + 1, tell)
+                progress(f"tuning {rule}", 0, _GENERATIONS)
+                # On sessions of another seed than those that judge it.
+                rules[rule] = tune(
+                    task,
+                    rules[rule],
+                    episodes=1024,
+                    generations=_GENERATIONS,
+                    seed=seed + 1,
+                    report=lambda number, *_, rule=rule: progress(
+                        f"tuning {rule}", number, _GENERATIONS
+                    ),
+                )
     deciders: dict[str, Any] = {
         "random": Random(), "gain": Gain(), "rate": GainRate(), "shares": SHARES,
         "ahead": AHEAD, **rules,
@@ -209,19 +216,6 @@ def evaluate(
         reference=results[methods.index(rival)].values[:, 0],
         rival=rival,
         rules=rules,
-    )
-
-
-def _tuned(task: Any, rule: Rule, seed: int, tell: Callable[[int, int], None]) -> Rule:
-    """Tuned on sessions of another seed than those that judge it."""
-    tell(0, _GENERATIONS)
-    return tune(
-        task,
-        rule,
-        episodes=1024,
-        generations=_GENERATIONS,
-        seed=seed,
-        report=lambda number, *_: tell(number, _GENERATIONS),
     )
 
 

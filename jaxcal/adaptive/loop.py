@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.history import (
     after,
@@ -21,6 +20,7 @@ from jaxcal.adaptive.history import (
     step_keys,
     what_is_left,
 )
+from jaxcal.adaptive.lookahead import fit
 from jaxcal.adaptive.particles import ParticleBelief
 from jaxcal.adaptive.rules import SHARES, Gain
 from jaxcal.adaptive.session import (
@@ -70,7 +70,7 @@ def next_measurement(
         history: (design, outcome) of each measurement in order. A design is an index of
             ``task.designs`` (a whole number) or its coordinates.
         decider: when not given, the largest expected gain; where time or uses count,
-            what ``fit_ahead.fit`` finds for the task and this budget, in some seconds
+            what ``lookahead.fit`` finds for the task and this budget, in some seconds
             at the first call.
         seconds: budget of the whole session; the task's when not given.
         uses: budget of the countable resource; the task's when not given.

@@ -14,7 +14,7 @@ import importlib
 import importlib.util
 import pathlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 from jaxcal.extras import installed
@@ -235,11 +235,6 @@ class RunConfig(abc.ABC):
             "seed": self.seed,
             "num_seeds": self.num_seeds,
         }
-
-    @staticmethod
-    def held_in(meta: Mapping[str, Any]) -> dict[str, Any]:
-        """The fields that ``as_meta`` described, but for ``ppo``."""
-        return {name: meta[name] for name in ("seed", "num_seeds")}
 
 
 @dataclasses.dataclass(frozen=True)

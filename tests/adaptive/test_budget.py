@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from jaxcal.adaptive import next_measurement, play, run
-from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.lookahead import AHEAD
+from jaxcal.adaptive.lookahead import AHEAD, fit
 from jaxcal.adaptive.policy.network import (
     Exercise,
     PolicyDecider,

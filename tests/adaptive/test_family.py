@@ -13,8 +13,8 @@ from benchmarks.sequential.family.draws import BUDGETS, draw
 from benchmarks.sequential.family.padded import SHAPE, batch, pad, stack
 from benchmarks.sequential.family.structures import HELD_OUT, TRAINED_ON, Limits
 from jaxcal.adaptive import next_measurement, play
-from jaxcal.adaptive.fit_ahead import fit
 from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.lookahead import fit
 from jaxcal.adaptive.rules import SHARES, Gain, Random
 from jaxcal.adaptive.tasks.knee import knee
 

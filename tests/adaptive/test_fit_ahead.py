@@ -6,10 +6,9 @@ import pytest
 
 from benchmarks.sequential.family.draws import draw
 from benchmarks.sequential.family.structures import Limits
-from jaxcal.adaptive import fit_ahead
+from jaxcal.adaptive import lookahead
 from jaxcal.adaptive.episodes import compare
-from jaxcal.adaptive.fit_ahead import fit
-from jaxcal.adaptive.lookahead import AHEAD
+from jaxcal.adaptive.lookahead import AHEAD, fit
 from jaxcal.adaptive.rules import SHARES
 
 
@@ -22,7 +21,7 @@ def task(request):
 
 
 def of(task):
-    return fit_ahead._Task(
+    return lookahead._Task(
         "", task, np.asarray(task.seconds), np.asarray(task.num_uses)
     )
 
@@ -43,7 +42,7 @@ def test_the_kernels_sessions_are_those_of_the_other_simulator(task):
 
 def test_the_same_task_and_budget_have_the_same_constants(task):
     one, same = fit(task, 9.0, 1), fit(task, 9.0, 1)
-    fit_ahead._fit.cache_clear()
+    lookahead._fit.cache_clear()
     again = fit(task, 9.0, 1)
     assert one is same
     chosen = [of(task).play(decider, 64, 3)[1] for decider in (one, again)]
@@ -57,10 +56,10 @@ def test_the_rule_decides_where_the_tree_loses(task, monkeypatch):
         nats = 1.0 + (decider.effort == 0.0) + 0.1 * rng.random((count, 1))
         return nats, np.zeros((count, 1), np.int32)
 
-    monkeypatch.setattr(fit_ahead._Task, "play", play)
-    fit_ahead._fit.cache_clear()
+    monkeypatch.setattr(lookahead._Task, "play", play)
+    lookahead._fit.cache_clear()
     found = fit(task)
-    fit_ahead._fit.cache_clear()
+    lookahead._fit.cache_clear()
     assert found is SHARES
 
 

@@ -76,7 +76,8 @@ class PolicyConfig(RunConfig):
                 k: tuple(v) if isinstance(v, list) else v for k, v in options.items()
             },
             ppo=StreamsConfig(**meta["ppo"]),
-            **RunConfig.held_in(meta),
+            seed=meta["seed"],
+            num_seeds=meta["num_seeds"],
             **meta["network"],
         )
 

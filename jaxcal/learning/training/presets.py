@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 _GROUP = "jaxcal.presets"  # entry points: the presets of installed packages
 
-_PLAIN = ("preset", "imitation")  # fields that JSON holds as is
-
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig(RunConfig):
@@ -61,7 +59,8 @@ class TrainConfig(RunConfig):
     def as_meta(self) -> dict[str, Any]:
         """Plain JSON values; ``from_meta`` reads them back."""
         return super().as_meta() | {
-            **{name: getattr(self, name) for name in _PLAIN},
+            "preset": self.preset,
+            "imitation": self.imitation,
             "network": dataclasses.asdict(self.network),
             "tasks": [task.as_meta() for task in self.tasks],
         }
@@ -69,8 +68,7 @@ class TrainConfig(RunConfig):
     @staticmethod
     def from_meta(meta: dict[str, Any]) -> TrainConfig:
         return TrainConfig(
-            **{name: meta[name] for name in _PLAIN},
-            **RunConfig.held_in(meta),
+            **{n: meta[n] for n in ("preset", "imitation", "seed", "num_seeds")},
             network=NetworkConfig(**meta["network"]),
             ppo=EpisodesConfig(**meta["ppo"]),
             tasks=tuple(Task.from_meta(task) for task in meta["tasks"]),
