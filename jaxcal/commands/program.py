@@ -33,7 +33,6 @@ _HERE = {  # command: one line of help, and the module with its flags and functi
     ),
     "predict": ("outputs of a calibrated machine for given commands", "calibrations"),
     "command": ("commands that reach given outputs", "calibrations"),
-    "loop": ("measure in a closed loop driven by another program", "loops"),
     "example": ("files to try the commands with", "program"),
     "doctor": ("versions and devices, for a bug report", "program"),
 }
@@ -84,7 +83,7 @@ def run(argv: list[str] | None = None) -> int:
     program = f"jaxcal {arguments.command}"
 
     def command() -> int:
-        with told(arguments.command != "loop"), warnings.catch_warnings():
+        with told(at_end=True), warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = lambda warning, *_: print(
                 f"{program}: warning:",

@@ -5,11 +5,12 @@ import signal
 import subprocess
 import sys
 
+import closed_loop_lines
 import numpy as np
 import pytest
+from closed_loop_lines import answers
 
 from jaxcal.adaptive.loop import Loop
-from jaxcal.adaptive.protocol import answers
 from jaxcal.adaptive.tasks import registry
 
 FILE = """
@@ -106,7 +107,7 @@ def test_what_is_wrong_is_answered_and_changes_nothing(task, line, message):
 
 def start(file, *more):
     return subprocess.Popen(
-        [sys.executable, "-m", "jaxcal", "loop", str(file), *map(str, more)],
+        [sys.executable, closed_loop_lines.__file__, str(file), *map(str, more)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True, bufsize=1,
     )  # fmt: skip

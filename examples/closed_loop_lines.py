@@ -1,15 +1,26 @@
-"""A closed loop for other programs: a JSON object per line, each with an answer.
+"""A closed loop that a program in any language drives by lines of JSON.
+
+    $ python examples/closed_loop_lines.py peak.py --journal session.jsonl
+    {"do": "suggest"}
+    {"number": 0, "design": 15, "coordinates": [3.05], "gain": 0.055, ...}
+    {"do": "observed", "outcome": 0.42}
+    {"number": 1}
+    {"do": "state"}
 
 ``do`` is ``suggest``, ``observed`` or ``state``: see docs/adaptive.md. ``observed``
 takes the outcome of what was suggested, or with a ``design``, an index or coordinates,
 that of another one; with a ``number`` it is refused unless that measurement is the
-next, so a program that does not know whether its last line arrived sends it again.
+next, so a program that does not know whether its last line arrived sends it again. Each
+outcome is in the journal before the answer; killed, a session resumes when started
+again.
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
+import sys
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -17,6 +28,7 @@ import jax
 import numpy as np
 
 from jaxcal.adaptive.loop import Loop, estimates
+from jaxcal.adaptive.tasks import registry
 from jaxcal.evaluation.report import finite
 
 _FIELDS = {"suggest": (), "observed": ("outcome", "design", "number"), "state": ()}
@@ -85,3 +97,30 @@ def _state(loop: Loop) -> dict[str, Any]:
         "entropy": finite(belief.entropy()),
         "unknowns": {name: dataclasses.asdict(unknowns[name]) for name in unknowns},
     }
+
+
+def main() -> None:
+    """Answer standard input until it ends."""
+    parser = argparse.ArgumentParser(description="a closed loop by lines of JSON")
+    parser.add_argument("task", help="a task's name, or a Python file with an ENTRY")
+    parser.add_argument("--journal", help="of the session; one that exists is resumed")
+    more = {"nargs": "*", "default": [], "metavar": "OPTION=VALUE"}
+    parser.add_argument("--with", dest="options", help="options of the task", **more)
+    parser.add_argument("--seconds", type=float, help="budget [the task's]")
+    parser.add_argument("--uses", type=int, help="budget [the task's]")
+    parser.add_argument("--seed", type=int, default=0, help="of the random draws [0]")
+    given = parser.parse_args()
+    budget = {"seconds": given.seconds, "uses": given.uses, "seed": given.seed}
+    try:
+        entry = registry.load(given.task)
+        task = entry.make(**registry.options_from(entry, given.options))
+        with Loop(task, journal=given.journal, **budget) as session:
+            for answer in answers(session, iter(sys.stdin.readline, "")):
+                sys.stdout.write(answer)
+                sys.stdout.flush()
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()
