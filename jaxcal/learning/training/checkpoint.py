@@ -206,27 +206,28 @@ def read_meta(
 
 
 def _newest(
-    checkpoint: str | pathlib.Path | None, read: Callable[[pathlib.Path], Any]
+    checkpoint: str | pathlib.Path | None,
+    read: Callable[[pathlib.Path], Any],
+    aside: bool = False,
 ) -> Any:
     """What ``read`` returns of the newest step that it can read; newer ones are warned
-    of."""
-    path, result, failed = _newest_whole(checkpoint, read)
-    for reason in failed.values():
-        warnings.warn(f"{reason}; {path} is read instead", stacklevel=2)
-    return result
-
-
-def _newest_whole(
-    checkpoint: str | pathlib.Path | None, read: Callable[[pathlib.Path], Any]
-) -> tuple[pathlib.Path, Any, dict[pathlib.Path, CheckpointError]]:
-    """The newest step that ``read`` can read, what it returns, and why newer failed."""
+    of, and with ``aside`` renamed."""
     failed: dict[pathlib.Path, CheckpointError] = {}
     for path in weights.steps(checkpoint):
         try:
-            return path, read(path), failed
+            result = read(path)
+            break
         except CheckpointError as error:
             failed[path] = error
-    raise next(iter(failed.values()))
+    else:
+        raise next(iter(failed.values()))
+    for damaged, reason in failed.items():
+        instead = f"{path} is read instead"
+        if aside:
+            named = damaged.rename(damaged.with_name(f"damaged-{damaged.name}")).name
+            instead = f"it is now {named}, and the run continues from {path}"
+        warnings.warn(f"{reason}; {instead}", stacklevel=3)
+    return result
 
 
 def _meta(path: pathlib.Path, schema: str) -> dict[str, Any]:
@@ -307,16 +308,7 @@ def restore(
 ) -> tuple[TrainState, dict[str, Any]]:
     """The training state of the newest whole step, and its meta; ``fresh`` is one of
     the same shapes. A damaged step is renamed, warned of, and the one before read."""
-    path, restored, failed = _newest_whole(
-        folder, lambda path: _restored(path, fresh, schema)
-    )
-    for damaged, reason in failed.items():
-        aside = damaged.rename(damaged.with_name(f"damaged-{damaged.name}"))
-        warnings.warn(
-            f"{reason}; it is now {aside.name}, and the run continues from {path}",
-            stacklevel=2,
-        )
-    return restored
+    return _newest(folder, lambda path: _restored(path, fresh, schema), aside=True)
 
 
 def _restored(
