@@ -8,16 +8,12 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import Array, in_words, numbers
+from jaxcal.checks import Array, array_of, in_words, numbers
 
 
 def probabilities(likelihood: ArrayLike, at: Array, grid: Array) -> Array:
     """(A, Y, S) probabilities that sum to 1 over the outcomes."""
-    table = numbers("likelihood", likelihood)
-    if table.ndim != 3 or table.shape[::2] != (len(at), len(grid)):
-        raise ValueError(
-            f"likelihood must have shape ({len(at)}, Y, {len(grid)}), got {table.shape}"
-        )
+    table = array_of("likelihood", likelihood, len(at), "Y", len(grid))
     _require_not_negative("likelihood", table)
     total = table.sum(axis=1)
     if (bad := np.argwhere(np.abs(total - 1.0) > 1e-6)).size:
