@@ -47,12 +47,13 @@ def axis_letter(index: int, count: int) -> str:
 
 
 def require_unmasked(name: str, values: Any) -> None:
-    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+    if np.ma.is_masked(values):
         raise ValueError(f"{name} must not be masked; leave the masked rows out")
 
 
 def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
-    require_unmasked(name, values)
+    if isinstance(values, np.ma.MaskedArray):
+        require_unmasked(name, values)
     try:
         raw = np.asarray(values)
         if raw.dtype.kind not in "biufO":

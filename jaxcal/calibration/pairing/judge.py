@@ -234,7 +234,8 @@ def _table(
     readings = counted.sum() * measured.shape[1]
     unknown = int((free & (resolved.precisions == 0.0)).sum())
     few = not model.linear and readings < _READINGS * unknown
-    if counted.sum() < LEAST or few:
+    moved = np.delete(commands, model.fitting.sensed, axis=1)
+    if counted.sum() < LEAST or few or (moved == moved[0]).all():
         return None
     if shared:
         commands = commands - commands.mean(axis=0)
