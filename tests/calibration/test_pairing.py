@@ -406,6 +406,18 @@ def test_two_rows_from_elsewhere_are_told_beside_a_nearer_one():
     assert not verdict.good and "Rows 8, 9 are outliers" in verdict.reasons[0]
 
 
+def test_rows_of_one_output_in_another_unit_are_told_beside_right_outputs():
+    """Ten or thirty in a hundred of its readings are a tenth of what they should be."""
+    for share, least in ((0.1, 10), (0.3, 5)):
+        told = 0
+        for seed in range(10):
+            u, y = _table(seed, count=40)
+            wrong = np.random.default_rng(seed).random(len(y)) < share
+            y[wrong, 0] /= 10.0
+            told += not _verdict(u, y).verdict.good
+        assert told >= least, share
+
+
 def test_one_output_that_was_sorted_is_told():
     for seed in range(10):
         u, y = _table(seed)

@@ -265,17 +265,8 @@ def _found(
     pairing = _of_all(table, inputs, outputs, unit)
     if pairing is not None or not table.shared or len(outputs) == 1:
         return pairing
-    rows = len(table.mean) // len(outputs)
-    none = np.zeros(rows)
     for j, name in enumerate(outputs):
-        alone = dataclasses.replace(
-            table, commands=table.commands[:_ROWS_ALONE],
-            measured=table.measured[:_ROWS_ALONE, [j]],
-            counted=table.counted[:_ROWS_ALONE], mean=none, precision=none,
-            free=np.ones(rows, np.bool_), theta=none, scale=table.scale[[j]],
-            width=table.width[[j]],
-        )  # fmt: skip
-        pairing = _of_all(alone, inputs, (name,), unit)
+        pairing = _of_all(alone(table, j), inputs, (name,), unit)
         if pairing is None:
             continue
         moved = (pairing.match >= 0) & (pairing.match != np.arange(len(pairing.match)))
@@ -283,6 +274,18 @@ def _found(
             reason = f"{name} alone: {pairing.reason}"
             return dataclasses.replace(pairing, reason=reason, output=name)
     return None
+
+
+def alone(table: Table, output: int) -> Table:
+    """One output of a linear model without a prior, its first rows."""
+    rows = len(table.mean) // table.outputs
+    none, first, column = np.zeros(rows), slice(_ROWS_ALONE), [output]
+    return dataclasses.replace(
+        table, commands=table.commands[first], counted=table.counted[first],
+        measured=table.measured[first, column], mean=none, precision=none, theta=none,
+        free=np.ones(rows, np.bool_), scale=table.scale[column],
+        width=table.width[column],
+    )  # fmt: skip
 
 
 def _of_all(
@@ -352,8 +355,8 @@ def _of_all(
         match = path_match(len(match), best.hypothesis.starts)
     match = _certain(table, best, match, near)
     for fit in rivals:
-        alone = fit.hypothesis.extra is None and fit.hypothesis.kind != _APART
-        if not alone or fit.hypothesis.change or best.hypothesis.change:
+        by_rows = fit.hypothesis.extra is None and fit.hypothesis.kind != _APART
+        if not by_rows or fit.hypothesis.change or best.hypothesis.change:
             match = np.full_like(match, -1)
         match[match != fit.hypothesis.match] = -1  # where explanations agree
     return Mispairing(

@@ -10,12 +10,20 @@ import numpy as np
 from jaxcal.calibration.fit import linearised
 from jaxcal.calibration.pairing.fit import (
     SESSIONS,
+    Table,
     as_it_is,
     benign_fits,
     fitted,
     predicted,
 )
-from jaxcal.calibration.pairing.judge import LEAST, RATIO, Mispairing, better, of_fit
+from jaxcal.calibration.pairing.judge import (
+    LEAST,
+    RATIO,
+    Mispairing,
+    alone,
+    better,
+    of_fit,
+)
 from jaxcal.calibration.reasons import Reason, in_rows
 from jaxcal.calibration.resolution import COARSE, resolution
 from jaxcal.calibration.verdict import Verdict, bends
@@ -70,9 +78,20 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     table = of_fit(fit)
     if table is None or table.precision[table.free].any():
         return None
-    plain, stated = fitted(table, as_it_is(table)), np.asarray(fit.noise_std)
+    several = range(table.outputs if table.shared and table.outputs > 1 else 0)
+    tables = [
+        (table, [*range(table.outputs)]),
+        *((alone(table, j), [j]) for j in several),
+    ]
+    reasons = (_outliers_of(fit, part, outputs) for part, outputs in tables)
+    return next((reason for reason in reasons if reason is not None), None)
+
+
+def _outliers_of(fit: Fit, table: Table, outputs: list[int]) -> Reason | None:
+    """Outliers of some outputs that hide in the noise of a fit of their ``table``."""
+    plain, stated = fitted(table, as_it_is(table)), np.asarray(fit.noise_std)[outputs]
     rows = np.flatnonzero(~plain.inside & table.counted)
-    if not len(rows) or {*rows} == {*fit.outliers} or not better(plain, plain):
+    if {*rows} <= {*fit.outliers} or not better(plain, plain):
         return None
     spread = (table.measured / table.scale)[plain.inside].std(axis=0)
     if (plain.noise > 0.5 * spread)[plain.rms > RATIO * plain.noise].any():
@@ -80,7 +99,8 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     if fit.noise_known and (plain.noise * table.scale > RATIO * stated).any():
         return None  # what was stated is too small for the others too
     readings = (table.measured / table.scale)[rows]
-    noise = np.hypot(plain.noise, resolution(fit.measured, COARSE) / table.scale)
+    steps = resolution(fit.measured, COARSE)[outputs]
+    noise = np.hypot(plain.noise, steps / table.scale)
     away = np.abs(readings - predicted(table, plain)[rows]) / noise
     away, benign = away.max(axis=1), benign_fits(table, plain, plain)
     rows = rows[away >= _OFF]
@@ -90,8 +110,10 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     named = in_rows([*map(int, rows)])
     verb = "are outliers" if len(rows) > 1 else "is an outlier"
     others = f"{in_words(noise * table.scale)} {fit.measured_unit}".strip()
+    of_one = len(outputs) < len(fit.output_names)
+    which = f" of {fit.output_names[outputs[0]]}" if of_one else ""
     return Reason(
-        f"{named.capitalize()} {verb}, over {least:.2g} times the noise of the "
+        f"{named.capitalize()} {verb}{which}, over {least:.2g} times the noise of the "
         f"others, which is {others} without them.",
         f"repeat {named} (counted from 0), or leave out",
     )
@@ -113,11 +135,12 @@ def _uneven(fit: Fit) -> bool:
     flat = slopes.reshape(len(first), -1)
     flat = flat / ((flat**2).sum(axis=0) ** 0.5 + 1e-300)
     for _ in range(_TURNS):
-        away = (off.reshape(shape) ** 2).sum(axis=1) ** 0.5
-        weighted = flat.T * (1.0 / (away + _FLOOR)).repeat(shape[1])
+        weighted = flat.T * (1.0 / (np.abs(off) + _FLOOR))
         step, undetermined = dposv(weighted @ flat, weighted @ first)[1:]
         if undetermined:
             return False
         off = first - flat @ step
-    away = (off.reshape(shape) ** 2).sum(axis=1) ** 0.5
-    return bool(away.max() > _OFF * np.median(away))
+    away = np.sort(np.abs(off).reshape(shape), axis=0)
+    moved = int((flat.reshape(*shape, -1) != 0.0).any(axis=0).sum(axis=1).max())
+    middle = min((shape[0] + moved) // 2, shape[0] - 1)  # they meet as many readings
+    return bool((away[-1] > _OFF * away[middle]).any())
