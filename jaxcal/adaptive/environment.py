@@ -64,6 +64,9 @@ class TaskEnv(FunctionalEnv):
     def longest(self) -> int:
         return int(self._given.task.horizon)
 
+    def is_terminated(self, episode: _Episode, params: Any = None) -> jax.Array:
+        return jnp.asarray(self._given.task.over(episode.session))
+
     def observation(self, episode: _Episode) -> jax.Array:
         seen = episode.seen
         parts = seen.features, jnp.maximum(seen.log_score, -10.0), seen.valid

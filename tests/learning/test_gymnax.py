@@ -28,9 +28,27 @@ def task_env() -> Any:
 
 def test_it_has_every_member_of_gymnax_own_environment():
     named = {name for name in dir(environment.Environment) if name[0] != "_"}
-    old = {"get_obs", "is_terminal", "is_terminated", "discount"}
     gradients = {name for name in named if "transition_gradient" in name}
-    assert named - old - gradients <= set(dir(PosturesEnv))
+    assert named - gradients <= set(dir(PosturesEnv))
+
+
+@pytest.mark.parametrize("make", [lambda: PosturesEnv(SMALL), task_env])
+def test_a_state_says_whether_its_episode_has_ended(make):
+    env = make()
+    step, ends = jax.jit(env.step_env), 0
+    for seed in range(3):
+        _, state = env.reset_env(jax.random.key(seed))
+        for key in jax.random.split(jax.random.key(seed), env.longest):
+            assert not env.is_terminated(state) and env.discount(state) == 1.0
+            action = env.available(state).argmax()
+            obs, state, _, terminated, _ = step(key, state, action)
+            np.testing.assert_allclose(env.get_obs(state), obs, rtol=1e-5)
+            assert bool(env.is_terminal(state)) == bool(terminated)
+            if terminated:
+                ends += 1
+                assert env.discount(state) == 0.0
+                break
+    assert ends == 3
 
 
 def test_its_spaces_are_finite_and_hold_what_it_gives():

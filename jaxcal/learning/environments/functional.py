@@ -187,6 +187,22 @@ class FunctionalEnv(abc.ABC):
         """``observation`` of a state."""
         return self.observation(state)
 
+    def get_obs(self, state: Any, params: Any = None, key: Any = None) -> jax.Array:
+        """``observation`` of a state."""
+        return self.observation(state)
+
+    def is_terminated(self, state: Any, params: Any = None) -> jax.Array:
+        """() bool, whether the episode has ended by itself."""
+        return self.steps(state) >= self.longest
+
+    def is_terminal(self, state: Any, params: Any = None) -> jax.Array:
+        """``is_terminated`` of a state."""
+        return self.is_terminated(state, params)
+
+    def discount(self, state: Any, params: Any = None) -> jax.Array:
+        """() float32, 0 where the episode has ended by itself, else 1."""
+        return 1.0 - self.is_terminated(state).astype(jnp.float32)
+
     def is_truncated(self, state: Any, params: EnvParams | None = None) -> jax.Array:
         """() bool, whether ``params`` cut the episode off."""
         most = self.longest if params is None else params.max_steps_in_episode
