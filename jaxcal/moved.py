@@ -5,7 +5,6 @@ import sys
 from importlib.machinery import ModuleSpec
 
 MOVED = {  # longer names first
-    "jaxcal.adaptive.fit_ahead": "jaxcal.adaptive.lookahead",
     "jaxcal.adaptive.journal": "jaxcal.adaptive.loop",
     "jaxcal.adaptive.policy.features": "jaxcal.adaptive.policy.network",
     "jaxcal.adaptive.policy.sessions": "jaxcal.adaptive.policy.network",
@@ -48,11 +47,13 @@ MOVED = {  # longer names first
     "jaxcal.plots": "jaxcal.reports.plots",
     "jaxcal.selection.continuous": "jaxcal.designs.continuous",
     "jaxcal.selection.exact.volume": "jaxcal.selection.exact.exact",
+    "jaxcal.selection.fastest.motion": "jaxcal.designs.travel",
     "jaxcal.selection.fastest": "jaxcal.designs.travel",
+    "jaxcal.selection.policy.compact": "jaxcal.selection.policy.by_checkpoint",
     "rig.model": "rig_workbench.model",
-    "rig.readings.attitude": "rig.readings.geometry",
     "rig.readings.numbers": "rig_workbench.numbers",
     "rig.signals": "rig.faults",
+    "rig.simulator.plant": "rig_workbench.simulator.simulator",
     "rig.simulator": "rig_workbench.simulator",
     "rig.workbench.commission.characterise": "rig_workbench.commission.characterise",
     "rig.workbench.commission.setup": "rig_workbench.commission.setup",

@@ -32,6 +32,7 @@ from jaxcal.paper.datasets import (
     NUM_CANDIDATES,
     RANGES,
     SCALE,
+    checked_size,
     streams,
 )
 from jaxcal.paper.datasets import make_dataset as drawn
@@ -80,14 +81,13 @@ def make_dataset(
             given.
         progress: told how much of dataset0 is simulated.
     """
+    total = checked_size(name, seed, episodes)
     if name in RECORDED:
-        whole = recorded(name, seed, recordings)
-        return whole.part(0, EPISODES[name] if episodes is None else episodes)
+        return recorded(name, seed, recordings).part(0, total)
     if name != "dataset0":
-        return drawn(name, seed, episodes)
+        return drawn(name, seed, total)
     shape = (NUM_CANDIDATES, 3)
-    groups = range(EPISODES[name] if episodes is None else episodes)
-    pairs = [streams(name, seed, group) for group in groups]
+    pairs = [streams(name, seed, group) for group in range(total)]
     unit = np.stack([draw.random(shape) for draw, _ in pairs])
     noise = np.stack([rng.normal(0.0, NOISE_STD_DEG, shape) for _, rng in pairs])
     read = simulate(dataset0_robot(), RANGES.denormalise(unit), progress=progress)

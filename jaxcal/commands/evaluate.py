@@ -291,7 +291,7 @@ def _evaluations(
 def _dataset(name: str, options: EvaluateOptions) -> Dataset:
     from jaxcal.commands.tables import draw_sets, holds_sets
     from jaxcal.evaluation.dataset import Dataset, load_dataset
-    from jaxcal.paper.datasets import EPISODES
+    from jaxcal.paper.datasets import EPISODES, MADE
 
     if name in EPISODES:
         from jaxcal.paper.datasets import make_dataset
@@ -299,9 +299,9 @@ def _dataset(name: str, options: EvaluateOptions) -> Dataset:
         count = min(options.episodes or EPISODES[name], EPISODES[name])
         return make_dataset(name, options.seed, count)
     if Path(name).suffix.lower() not in (".npz", ".csv"):
+        drawn = ", ".join(known for known in EPISODES if known not in MADE)
         raise ValueError(
-            f"--dataset takes {', '.join(EPISODES)}, or a .npz or .csv file, got "
-            f"{name!r}"
+            f"--dataset takes {drawn}, or a .npz or .csv file, got {name!r}"
         )
     if not holds_sets(name):
         sets = draw_sets(name, options.episodes or _POOLED, options.seed)

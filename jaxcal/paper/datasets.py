@@ -60,6 +60,18 @@ def chunks(name: str, seed: int = 0, episodes: int | None = None) -> Iterator[Da
         seed: of the streams, 0 or greater.
         episodes: the first so many; all when not given.
     """
+    total = checked_size(name, seed, episodes)
+    if name in MADE:
+        raise ValueError(
+            f"{name} is simulated or recorded. Make {name}.npz with python -m "
+            f"benchmarks.paper.datasets {name} --out DIR, in the repository"
+        )
+    counts = [min(BLOCK, total - begin) for begin in range(0, total, BLOCK)]
+    return (_drawn(name, seed, block, count) for block, count in enumerate(counts))
+
+
+def checked_size(name: str, seed: int, episodes: int | None) -> int:
+    """How many episodes of a dataset are asked for, at most those that it has."""
     if name not in NAMES:
         raise ValueError(f"name must be one of {', '.join(NAMES)}, got {name!r}")
     if seed < 0:
@@ -69,13 +81,7 @@ def chunks(name: str, seed: int = 0, episodes: int | None = None) -> Iterator[Da
         raise ValueError(
             f"episodes must be in [1, {EPISODES[name]}] for {name}, got {total}"
         )
-    if name in MADE:
-        raise ValueError(
-            f"{name} is simulated or recorded. Make {name}.npz with python -m "
-            f"benchmarks.paper.datasets {name} --out DIR, in the repository"
-        )
-    counts = [min(BLOCK, total - begin) for begin in range(0, total, BLOCK)]
-    return (_drawn(name, seed, block, count) for block, count in enumerate(counts))
+    return total
 
 
 def _drawn(name: str, seed: int, block: int, count: int) -> Dataset:

@@ -418,6 +418,24 @@ def test_rows_of_one_output_in_another_unit_are_told_beside_right_outputs():
         assert told >= least, share
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_outliers_of_outputs_that_share_every_parameter_are_named(seed):
+    mixed = np.random.default_rng(0).normal(size=(3, 8))
+
+    def bent(commands, theta):
+        waves = np.sin(np.outer(commands[:, 0], np.arange(1, 9)) + commands[:, 1:])
+        return (waves * (theta + 0.02 * theta**2)) @ mixed.T
+
+    rng = np.random.default_rng(seed)
+    commands = rng.uniform(-2.0, 2.0, (16, 2))
+    measured = bent(commands, np.linspace(0.3, 0.9, 8))
+    measured += 0.01 * rng.normal(size=measured.shape)
+    model = FromFunction(bent, np.full(8, 0.5), inputs=2, batch=True)
+    measured[[2, 5, 9, 14]] += 0.2
+    told = str(_verdict(commands, measured, model=model, loss="gaussian").verdict)
+    assert "Rows 2, 5, 9, 14 are outliers" in told
+
+
 def test_one_output_that_was_sorted_is_told():
     for seed in range(10):
         u, y = _table(seed)

@@ -74,7 +74,8 @@ def write(
     theta, pairs, tips = as_parameters(model, parameters), [], [""]
     arms = getattr(model, "chains", (model,))
     members = getattr(model, "members", (slice(None),))
-    for arm, of_arm in zip(arms, members, strict=True):
+    names = getattr(model, "tips", ("",))  # of several arms
+    for arm, name, of_arm in zip(arms, names, members, strict=True):
         ratios, yields, waves = arm._drives(theta[of_arm])
         at = np.flatnonzero(ratios != 1.0)
         lost = [f"gear{i + 1} is {ratios[i]:.6g}" for i in at]
@@ -82,7 +83,10 @@ def write(
         bent = np.flatnonzero(waves.any(axis=1))
         lost += [f"harmonics of joint {arm.harmonics[i]}" for i in bent]
         if lost:
-            raise ValueError(f"{', '.join(lost)}, which this file format cannot hold")
+            whose = f"{name}: " if name else ""
+            raise ValueError(
+                f"{whose}{', '.join(lost)}, which this file format cannot hold"
+            )
         pairs.append((arm, arm.calibrated(theta[of_arm])))
     one_of("form", form, ("urdf", "dh", "ur") if len(arms) == 1 else ("urdf",))
     if form == "urdf":

@@ -343,7 +343,8 @@ def _of_all(
     named = [what_is_wrong(table, fit, {}, unit) for fit in rivals]
     others = [*dict.fromkeys(x for x in named if x not in reason)][:_NAMED]
     reason = "; or ".join([reason, *others])
-    if sum(_mirrors(fit.hypothesis.change) for fit in (best, *rivals)) > 2:
+    alike = [_mirrors(fit.hypothesis.change) for fit in (best, *rivals)]
+    if len(alike) > 2 and all(alike):
         axes = ", ".join(outputs)
         reason = (
             f"the readings are mirrored: one of {axes} has the other sign or two of "

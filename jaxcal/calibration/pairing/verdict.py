@@ -141,6 +141,7 @@ def _uneven(fit: Fit) -> bool:
             return False
         off = first - flat @ step
     away = np.sort(np.abs(off).reshape(shape), axis=0)
-    moved = int((flat.reshape(*shape, -1) != 0.0).any(axis=0).sum(axis=1).max())
+    by = (flat.reshape(*shape, -1) != 0.0).any(axis=0)  # (q, F)
+    moved = int((by / by.sum(axis=0).clip(1)).sum(axis=1).max())
     middle = min((shape[0] + moved) // 2, shape[0] - 1)  # they meet as many readings
     return bool((away[-1] > _OFF * away[middle]).any())

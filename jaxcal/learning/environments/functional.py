@@ -145,8 +145,8 @@ class FunctionalEnv(abc.ABC):
         """One step, and a new episode after the last of one: observation, state, ()
         reward, () bool terminated, () bool truncated, and info: ``action_mask``
         (num_actions,) of the state that is returned, the environment's ``metric`` (),
-        ``terminated``, ``truncated``, and ``final_observation``, of the episode that
-        the step was made in."""
+        ``terminated``, ``truncated``, ``discount`` (0 at a natural end, else 1) and
+        ``final_observation``, of the episode that the step was made in."""
         key_step, key_reset = jax.random.split(key)
         stepped = self.step_env(key_step, state, action, params)
         last, after, reward, terminated, info = stepped
@@ -155,6 +155,7 @@ class FunctionalEnv(abc.ABC):
         obs, state = renewed(self.reset_env, over, key_reset, (last, after))
         info |= {"action_mask": self.available(state), "final_observation": last}
         info |= {"terminated": terminated, "truncated": truncated}
+        info["discount"] = 1.0 - terminated.astype(jnp.float32)
         return obs, state, reward, terminated, truncated, info
 
     # -- as gymnax names them ----------------------------------------------------------
