@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 gymnasium = pytest.importorskip("gymnasium")
+pytest.importorskip("jaxcal.learning.gym")  # registers them, whichever test is first
 
 
 @pytest.mark.slow
