@@ -83,7 +83,7 @@ class PauseRequested(BaseException):
 
 
 def unheard(event: str, **fields: object) -> None:
-    """A report that nobody takes."""
+    """The default ``report``: does nothing."""
 
 
 def told(error: BaseException) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from scipy.signal import lfilter
@@ -172,16 +173,26 @@ def training_curves(runs: Mapping[str, pathlib.Path]) -> Figure:
         x, reward = metrics["episodes"] / 1000.0, metrics["reward_mean"]
         axes.plot(x, reward, color=colour, linewidth=0.8, alpha=0.3)
         axes.plot(x, smoothed(reward), color=colour, label=name)
-        finite = np.isfinite(ratio := metrics.get("ratio_to_exact", np.nan * x))
-        if finite.any():
-            twin = axes.twinx() if twin is None else twin
-            twin.plot(x[finite], ratio[finite], color=colour, linestyle="--")
-            twin.set(ylabel="dashed: mean det S / det S*", ylim=(0.0, 1.02))
+        twin = share_of_optimum(axes, twin, metrics, colour)
     unit = "reward (log det S, scaled)"
     axes.set(xlabel="training episodes (thousands)", ylabel=unit)
     place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.2)}
     axes.legend(fontsize=8, frameon=False, ncols=3, **place)
     return figure
+
+
+def share_of_optimum(
+    axes: Axes, twin: Axes | None, metrics: Mapping[str, Array], colour: str
+) -> Axes | None:
+    """Draw a run's share of the optimum, dashed, on ``twin``, or on an axis beside that
+    of ``axes``; the axis that it is on, ``twin`` where the run was not validated."""
+    x = metrics["episodes"] / 1000.0
+    finite = np.isfinite(ratio := metrics.get("ratio_to_exact", np.nan * x))
+    if finite.any():
+        twin = axes.twinx() if twin is None else twin
+        twin.plot(x[finite], ratio[finite], color=colour, linestyle="--")
+        twin.set(ylabel="dashed: mean det S / det S*", ylim=(0.0, 1.02))
+    return twin
 
 
 def smoothed(values: Array) -> Array:

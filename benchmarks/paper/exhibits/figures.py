@@ -17,6 +17,7 @@ from jaxcal.evaluation.figures import (
     name_det_axis,
     read_metrics,
     reference_name,
+    share_of_optimum,
     smoothed,
     titled,
     with_random,
@@ -119,11 +120,7 @@ def training_panels(runs: Mapping[str, pathlib.Path]) -> Figure:
         bars = {"histtype": "step", "density": True, "color": colour, "label": text}
         spread.hist(last, bins=min(50, max(5, len(last) // 10)), **bars)
         smooth.plot(x, smoothed(reward), color=colour, label=name)
-        finite = np.isfinite(ratio := metrics.get("ratio_to_exact", np.nan * x))
-        if finite.any():
-            twin = smooth.twinx() if twin is None else twin
-            twin.plot(x[finite], ratio[finite], color=colour, linestyle="--")
-            twin.set(ylabel="dashed: mean det S / det S*", ylim=(0.0, 1.02))
+        twin = share_of_optimum(smooth, twin, metrics, colour)
     unit = "reward (log det S, scaled)"
     for axes, title in ((curve, "(a) reward"), (smooth, "(c) smoothed curve")):
         axes.set_title(title, fontsize=10)

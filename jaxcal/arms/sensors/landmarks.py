@@ -76,7 +76,7 @@ class Landmarks(Sensor):
 
     def place(self, i: int, rows: Rows, tip: Tip, measured: Array | None) -> Array:
         """(width,) where number ``i`` stands, of its rows (K,)."""
-        raise NotImplementedError
+        raise NotImplementedError  # abstract: each kind of landmark has its own
 
     def of_rows(self, inputs: Array) -> Indices:
         if self.count == 1:
