@@ -71,8 +71,8 @@ def line_here(config, emit):
 
 LINES = line_here  # of sessions in this process; those of commands have their own
 # Below the range from which the system assigns ports: no other test's connection or
-# server can take one before it is used.
-PORTS = itertools.count(random.SystemRandom().randrange(12_000, 30_000))
+# server can take one before it is used. Above 2055x: tests replace "port = 2055".
+PORTS = itertools.count(random.SystemRandom().randrange(21_000, 30_000))
 RATE_HZ = 250.0
 MODBUS_MAPS = [n for n in available_maps() if isinstance(load_map(n), RegisterMap)]
 SPEEDUP = 3.0  # of the drives over what the configuration says of them

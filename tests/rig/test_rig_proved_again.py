@@ -251,7 +251,7 @@ def test_a_drive_that_ignores_its_speed_is_named(factor, at, capsys, monkeypatch
     monkeypatch.setattr(motion, "TOO_FAST", 1.6)
     with proved(at, capsys, speedup=1.0) as sim:
         sim.faults.add(parse_fault(f"fast_drive,axis=yaw,factor={factor}"))
-        text = (at / "rig.toml").read_text().replace("= 400", "= 20")
+        text = (at / "rig.toml").read_text().replace("deg_s = 400", "deg_s = 20")
         (at / "rig.toml").write_text(text.replace("_s2 = 8000", "_s2 = 400"))
         code, said = session(capsys)
         assert code == 3, said
@@ -262,8 +262,8 @@ def test_a_drive_that_ignores_its_speed_is_named(factor, at, capsys, monkeypatch
 def test_axes_stop_a_drive_that_is_too_fast(at, capsys, monkeypatch):
     monkeypatch.setattr(motion, "TOO_FAST", 1.6)
     with device(speedup=1.0) as (sim, bus, port):
-        text = quick_text(bus, port).replace("= 400", "= 20")
-        (at / "rig.toml").write_text(text.replace("= 8000", "= 400"))
+        text = quick_text(bus, port).replace("deg_s = 400", "deg_s = 20")
+        (at / "rig.toml").write_text(text.replace("_s2 = 8000", "_s2 = 400"))
         assert main(["scan", "--units", "3"]) == 0
         assert main(["home", "--here", "--yes"]) == 0
         sim.faults.add(parse_fault("fast_drive,axis=yaw,factor=20"))
