@@ -321,11 +321,8 @@ def _moved(case: Case) -> int:
 def _name(case: Case, i: int) -> str:
     model = case.options.get("model")
     inputs = getattr(model, "inputs", ())
-    return (
-        inputs[i]
-        if inputs
-        else ("u_" + "xyz"[i] if case.commands.shape[1] == 3 else f"u_{i + 1}")
-    )
+    name = "u_" + "xyz"[i] if case.commands.shape[1] == 3 else f"u_{i + 1}"
+    return f"({inputs[i]}|{name})" if inputs else name  # as refused, or as fitted
 
 
 # -- right tables ---------------------------------------------------------------------
@@ -418,12 +415,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--models", default=",".join(MODELS))
-    parser.add_argument("--kinds", default="")
+    parser.add_argument("--kinds", default="", help="split by /")
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--right", type=int, default=300)
     parser.add_argument("--verbose", action="store_true")
     args = parser.parse_args()
-    kinds = args.kinds.split(",") if args.kinds else [*ROWS, *COLUMNS]
+    kinds = args.kinds.split("/") if args.kinds else [*ROWS, *COLUMNS]
     for name in filter(None, args.models.split(",")):
         for kind in kinds:
             spoil = ROWS.get(kind) or COLUMNS[kind]

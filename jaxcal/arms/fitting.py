@@ -22,6 +22,7 @@ class ArmFitting(Fitting):
     result_type = late("jaxcal.arms.written:ArmCalibration")
     # Functions of the model, in modules that know it.
     anew = late("jaxcal.arms.plausible:anew", of="model")
+    apart = late("jaxcal.arms.plausible:apart", of="model")
     prepared = late("jaxcal.arms.plausible:prepared", of="model")
     require_commands = late("jaxcal.arms.plausible:require_commands", of="model")
     improved = late("jaxcal.arms.effects:improved", of="model")

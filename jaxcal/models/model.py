@@ -136,6 +136,11 @@ class Fitting:
         """Rows of commands (N, n) for which the model fails, and why."""
         return {}
 
+    def apart(self, commands: Array, measured: Array) -> tuple[Array, Array] | None:
+        """How far rows are from one another, whatever the parameters: (N, N) by the
+        commands and (N, N) by the readings. None where the parameters say that too."""
+        return None
+
     def anew(self, commands: Array, measured: Array) -> Any:
         """The model as ``prepared`` has it, where its sensor stood before forgotten."""
         return self.model

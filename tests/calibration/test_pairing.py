@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 import re
 import warnings
 
 import contacts
+import fr3
 import numpy as np
+import positioner
 import pytest
 import ur5
 
@@ -486,6 +489,36 @@ def test_an_arm_whose_readings_are_mirrored(columns):
     assert not told.good
     mirrored = "the readings are mirrored: one of y_x, y_y, y_z has the other sign or"
     assert told.reasons[0].startswith(mirrored)
+
+
+def _views(example, seed=0):
+    """20 real views of a board and one more: commands, with the pose that was seen."""
+    table = example.load()
+    return table[np.random.default_rng(seed).choice(len(table), 21, replace=False)]
+
+
+@pytest.mark.parametrize("example", [fr3, positioner])
+def test_views_of_a_board_that_lost_their_order_or_one_of_them(example):
+    """By how far the tip turns from row to row, whatever is known of the camera."""
+    table, joints = _views(example), example.arm().num_joints
+    zeros = np.zeros((20, 6))
+    told = functools.partial(_verdict, measured=zeros, model=example.arm())
+    views = table[:20].copy()
+    assert told(views).mispairing is None
+    for kind, column in (("commands", 0), ("readings", joints)):
+        moved = np.argsort(views[:, column])
+        side = slice(0, joints) if kind == "commands" else slice(joints, None)
+        table = views.copy()
+        table[:, side] = views[moved, side]
+        assert told(table).mispairing.reason.startswith(f"the {kind} are sorted")
+        right = told(table).mispairing.repaired(table, zeros)[0]
+        assert {tuple(row) for row in right} == {tuple(row) for row in views}
+    table = views.copy()
+    table[[4, 11], joints:] = views[[11, 4], joints:]
+    assert "rows 4, 11 are exchanged" in told(table).mispairing.reason
+    table = np.hstack([views[:19, :joints], np.delete(views, 14, axis=0)[:, joints:]])
+    lost = _verdict(table, zeros[:19], model=example.arm()).mispairing
+    assert lost.reason.startswith("from row 14 on, readings are one row early")
 
 
 @pytest.mark.parametrize("name", ["panda_1", "kuka_14"])

@@ -234,11 +234,7 @@ class Board(Sensor):
                 f"place is missing for {len(inputs)} views of a board; {_FEW} views by "
                 "one arm with the camera or the board determine it"
             )
-        if self.corners is None:
-            turn = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
-            shift = inputs[:, :3]
-        else:
-            turn, shift = self._poses(np.asarray(measured))
+        turn, shift = self.seen_poses(inputs, np.asarray(measured))
 
         def fit(turn: Array, shift: Array) -> tuple[float, Array, Array]:
             if self.moves == "camera":
@@ -275,8 +271,12 @@ class Board(Sensor):
     def standing(self) -> Board:
         return dataclasses.replace(self, place=None)  # every arm has a tool of its own
 
-    def _poses(self, pixels: Array) -> tuple[Array, Array]:
-        """Rotations (N, 3, 3) and places (N, 3) of the board (Zhang, 2000)."""
+    def seen_poses(self, inputs: Array, pixels: Array) -> tuple[Array, Array]:
+        """Rotations (N, 3, 3) and places (N, 3) of the board in the camera, as
+        ``inputs`` say or, of corners (Zhang, 2000), their pixels."""
+        if self.corners is None:
+            turn = Rotation.from_rotvec(inputs[:, 3:], degrees=True)
+            return turn.as_matrix(), inputs[:, :3]
         flat = np.asarray(self.corners)[:, :2]
         focal, centre = self.lens
         rays = (pixels.reshape(len(pixels), -1, 2) - centre) / focal

@@ -203,6 +203,10 @@ class Sensor(abc.ABC):
         where its tool is seen from the nominal one (4, 4), if that is new."""
         return self, None
 
+    def seen_poses(self, inputs: Array, read: Array) -> tuple[Array, Array] | None:
+        """Rotations (N, 3, 3) and places (N, 3) of what it sees, None: it sees none."""
+        return None
+
     @property
     def standing(self) -> Sensor:
         """This sensor, its place found by another arm: what ``located`` has to find."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ _MOST_OUT = 0.35, 0.2  # share of rows that may be outliers: as it is, paired an
 _WAVES = 6  # half periods of a drift
 _FREEDOM = 4.0  # of Student's t, of the robust start
 _ROUNDS = 6  # of robust weights, and of linearising
+_TURNS = 12  # of matching
 _RIDGE = 1e-11  # of a column's square: what no row excites stays at the prior's mean
 
 
@@ -95,6 +97,25 @@ class Table:
     def sensed(self) -> int:
         """Columns of the commands that come with the readings."""
         return self.commands[:, self.model.fitting.sensed].shape[1]
+
+    @functools.cached_property
+    def alike(self) -> Rows | None:
+        """(N,) match by which rows are as far apart by readings as by commands,
+        whatever the parameters: by each row's sorted distances first, then by those
+        from the rows that are matched. None where the model has no such distances."""
+        from scipy.optimize import linear_sum_assignment
+
+        gaps = self.model.fitting.apart(self.commands, self.measured)
+        if gaps is None:
+            return None
+        near, match = [np.sort(gap, axis=1) for gap in gaps], np.zeros(0, dtype=np.intp)
+        for _ in range(_TURNS):
+            off = np.abs(near[1][:, None] - near[0]).sum(axis=-1)
+            before, match = match, linear_sum_assignment(off)[1]
+            if np.array_equal(before, match):
+                break
+            near = [gaps[0][:, match], gaps[1]]
+        return match
 
     @property
     def levels(self) -> int:
@@ -204,6 +225,7 @@ class Fitted(NamedTuple):
     theta: Array  # (p,)
     inside: Mask  # (N,) readings that are paired and no outliers
     solution: Array  # (r, c) of the linear system
+    table: Table  # as it was fitted: its sensor may be where other rows put it
 
 
 def log_evidence(table: Table, square: Array, count: Any, extra: int = 0) -> Array:
@@ -366,11 +388,13 @@ def judged(table: Table, hypothesis: Hypothesis, rows: Rows) -> Fitted:
         theta,
         inside,
         solution,
+        table,
     )
 
 
-def predicted(table: Table, fit: Fitted) -> Array:
+def predicted(fit: Fitted) -> Array:
     """(N, q) what a fit says of the commands as they stand, in scales."""
+    table = fit.table
     if table.shared:
         regressors = table.model.blocks(table.commands)[:, 0]
         return np.asarray(regressors @ fit.solution[: regressors.shape[1]])

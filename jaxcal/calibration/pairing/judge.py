@@ -328,7 +328,7 @@ def _of_all(
     near: dict[int, list[int]] = {}
     if best.hypothesis.kind == "path":
         with contextlib.suppress(ValueError):
-            at_best, rows_near = polished(table, best)
+            at_best, rows_near = polished(best)
             best, near = (best, {}) if _few(at_best) else (at_best, rows_near)
     rivals = _as_good(table, best, fits)
     if best.hypothesis.kind not in _FREQUENT:
@@ -522,7 +522,7 @@ def better(fit: Fitted, best: Fitted, ratio: float = RATIO) -> bool:
 def _explains(plain: Fitted, fit: Fitted) -> bool:
     """Whether nothing is left to explain."""
     sure = fit.evidence - plain.evidence > _SURE or fit.hypothesis.kind == _APART
-    return sure and bool((fit.rms < 0.1 * plain.rms).any())
+    return sure and bool((fit.rms < 0.1 * plain.rms).all())
 
 
 def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
@@ -551,7 +551,7 @@ def _alternatives(table: Table, plain: Fitted) -> list[Fitted]:
     paths = [fit for fit in fits if fit.hypothesis.kind == "path"]
     for path in top(paths, 2):
         with contextlib.suppress(ValueError):
-            fits.append(polished(table, path)[0])
+            fits.append(polished(path)[0])
     for search in (_apart, exchanged, sorted_alone):
         with contextlib.suppress(ValueError):
             fits += search(table, plain)

@@ -56,7 +56,7 @@ _MOST_ROWS = 150  # of a table whose lost order is looked for
 _STARTS, _REFINED, _ROUNDS = 12_000, 8, 12  # of that search: rows times starts, ...
 _SOLVED = 0.003  # share of the squares that the right order leaves
 _FAR = 1e9  # noises: what a model cannot predict
-_TURNS = 6  # of assigning readings and fitting
+_TURNS = 12  # of assigning readings and fitting
 
 
 def changed_columns(
@@ -64,7 +64,8 @@ def changed_columns(
 ) -> list[Fitted]:
     """Columns with another sign, unit or place."""
     least = 0.1 if table.model.fitting.resolution else 0.02
-    if table.shared or not (plain.rms > least * table.width).any():
+    size = np.maximum(plain.rms, plain.noise)  # rms is less, where a prior is known
+    if table.shared or not (size > least * table.width).any():
         return []
     tables, every = [], np.flatnonzero(table.counted)
     theta = table.theta if not table.free.any() else table.mean
@@ -73,7 +74,7 @@ def changed_columns(
         anew = _anew(table, hypothesis, every)
         with contextlib.suppress(ValueError):  # the number of a chain has no sign
             if anew is not None:
-                tables.append((_distance(anew, hypothesis, every), anew, hypothesis))
+                tables.append((_left_over(anew, hypothesis, every), anew, hypothesis))
     tables.sort(key=lambda row: row[0])
     return [
         fit
@@ -140,9 +141,9 @@ def _kinds_of_columns(
     ``theta`` (p,) are expected also in counts."""
     moved = table.commands.shape[1] - table.sensed
     tables = [(inputs, moved, False)]
-    # A machine that hardly moves has zero readings everywhere, as contacts.
-    read = table.measured.any()
-    if read and not table.model.fitting.relative:
+    # A machine that hardly moves has zero readings everywhere, as contacts, not views.
+    read = table.measured.any() or table.alike is not None
+    if table.measured.any() and not table.model.fitting.relative:
         tables.append((outputs, len(outputs), True))
     ways = {"has the other sign": -1.0} | (_UNITS if read else {})
     changes: list[ColumnChange] = []
@@ -211,19 +212,40 @@ def _multiple(table: Table, theta: Array) -> float:
     return 0.0 if near_unit else float(np.median(times))
 
 
-def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
-    """Log size of what is off before anything is fitted that a prior is known of."""
-    off = table.residuals(hypothesis, rows, table.theta)
-    if table.flat:
-        with contextlib.suppress(ValueError):  # least squares about ``theta``
-            slopes, right = table.system(hypothesis, rows)
-            flat = slopes.reshape(-1, slopes.shape[-1])
-            aim = flat.T @ right.reshape(len(flat), -1)
-            solution = solved(flat.T @ flat, aim, table.ridge(flat.shape[1]))
-            off = np.asarray((right - slopes @ solution).reshape(len(rows), -1))
-    size = float(np.log(np.median(np.abs(off), axis=0) + 1e-300).sum())
+def _left_over(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
+    """Log size of what least squares about ``theta`` leaves, of all outputs together,
+    with how far it moves what a prior is known of."""
+    off, moved = _least_squares(table, hypothesis, rows)
+    if table.levels == 1:
+        size = 0.5 * table.outputs * float(np.log((off**2).sum() + moved + 1e-300))
+    else:
+        size = 0.5 * float(np.log((off**2).sum(axis=0) + 1e-300).sum())
     if hypothesis.change is not None:
         size -= hypothesis.change.log_size
+    return size if size == size else np.inf
+
+
+def _least_squares(
+    table: Table, hypothesis: Hypothesis, rows: Rows
+) -> tuple[Array, float]:
+    """(K, q) residuals of least squares about ``theta``, and the prior's share."""
+    slopes, right = table.system(hypothesis, rows)
+    size, columns = len(rows) * slopes.shape[1], slopes.shape[2]
+    flat, aim = slopes.reshape(size, columns), right.reshape(size, -1)
+    ridge = table.ridge(columns)
+    solution = solved(flat.T @ flat, flat.T @ aim, ridge)
+    off = (aim - flat @ solution).reshape(len(rows), -1)
+    return off, float((ridge[:, None] * solution**2).sum())
+
+
+def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
+    """Median log size of what is off before anything is fitted that a prior is known
+    of."""
+    off = table.residuals(hypothesis, rows, table.theta)
+    if table.flat:
+        with contextlib.suppress(ValueError):
+            off = _least_squares(table, hypothesis, rows)[0]
+    size = float(np.log(np.median(np.abs(off), axis=0) + 1e-300).sum())
     return size if size == size else np.inf
 
 
@@ -237,6 +259,8 @@ def _anew(table: Table, hypothesis: Hypothesis, rows: Rows) -> Table | None:
         )
     except ValueError:
         return None
+    if model is table.model:
+        return table
     mean = table.mean + np.asarray(model.nominal) - table.model.nominal
     return dataclasses.replace(table, model=model, mean=mean, theta=mean)
 
@@ -249,6 +273,7 @@ def places(table: Table) -> list[Table]:
     windows = [(every, every), (every, every[:half]), (every, every[half:])]
     matches = [shifted(count, by) for by in (1, -1, 2, -2, 3, -3)]
     matches += [every[::-1], (every + half) % count, (every - half) % count]
+    matches += [] if table.alike is None else [table.alike]
     windows += [(match, every) for match in matches]
     ranked = []
     for match, rows in windows:
@@ -261,9 +286,9 @@ def places(table: Table) -> list[Table]:
     return [anew for _, anew in ranked[:_PLACES]] or [table]
 
 
-def polished(table: Table, fit: Fitted) -> tuple[Fitted, dict[int, list[int]]]:
+def polished(fit: Fitted) -> tuple[Fitted, dict[int, list[int]]]:
     """A path with its changes at their most probable rows, and rows about as good."""
-    path = list(fit.hypothesis.starts)
+    table, path = fit.table, list(fit.hypothesis.starts)
     near: dict[int, list[int]] = {}
     count, costs = len(table.commands), table.costs()
     noise = np.maximum(fit.noise, 1e-7)
@@ -274,7 +299,7 @@ def polished(table: Table, fit: Fitted) -> tuple[Fitted, dict[int, list[int]]]:
             match = path_match(count, [(0, by)])
             rows = np.flatnonzero((match >= 0) & table.counted)
             if len(rows):
-                off = _off(table, fit, match, rows) / noise
+                off = _off(fit, match, rows) / noise
                 inside = 0.5 * (off**2).sum(axis=1) + np.log(noise).sum()
                 inside += 0.5 * table.outputs * np.log(2.0 * np.pi)
                 cost[rows] = np.minimum(inside, costs[rows] + np.log(20.0))
@@ -300,22 +325,27 @@ def polished(table: Table, fit: Fitted) -> tuple[Fitted, dict[int, list[int]]]:
     return fit, near
 
 
-def _off(table: Table, fit: Fitted, match: Rows, rows: Rows) -> Array:
+def _off(fit: Fitted, match: Rows, rows: Rows) -> Array:
     """(K, q) residuals of rows paired by ``match``, in scales, at the fit."""
+    table = fit.table
     if table.shared:
         reading = table.measured[rows] / table.scale
-        return np.asarray(reading - predicted(table, fit)[match[rows]])
+        return np.asarray(reading - predicted(fit)[match[rows]])
     return table.residuals(Hypothesis("", match), rows, fit.theta)
 
 
-def assigned(table: Table, fit: Fitted, rows: Rows) -> Rows:
+def assigned(fit: Fitted, rows: Rows) -> Rows:
     """(N,) match in which readings of ``rows`` have those commands that fit best."""
     from scipy.optimize import linear_sum_assignment
 
-    match = fit.hypothesis.match.copy()
+    table, match = fit.table, fit.hypothesis.match.copy()
     commands = match[rows]
     noise = np.maximum(fit.noise, 1e-7)
-    off = table.measured[rows, None] / table.scale - predicted(table, fit)[commands]
+    if table.sensed:  # a reading brings columns of the commands
+        offs = [_off(fit, np.full_like(match, row), rows) for row in commands]
+        off = np.stack(offs, axis=1)
+    else:
+        off = table.measured[rows, None] / table.scale - predicted(fit)[commands]
     apart = np.minimum(np.nan_to_num(off / noise, nan=_FAR), _FAR) ** 2
     reading, other = linear_sum_assignment(apart.sum(axis=-1))
     match[rows[reading]] = commands[other]
@@ -326,9 +356,9 @@ def exchanged(table: Table, plain: Fitted) -> list[Fitted]:
     """Outliers whose readings fit one another's commands."""
     rows = np.flatnonzero(~plain.inside & table.counted)
     count = len(table.commands)
-    if not 2 <= len(rows) <= count // 2 or table.sensed:
+    if not 2 <= len(rows) <= count // 2:
         return []
-    match = assigned(table, plain, rows)
+    match = assigned(plain, rows)
     moved = np.flatnonzero(match != np.arange(count))
     if len(moved) < 2:
         return []
@@ -340,11 +370,13 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
     """Commands or readings that were sorted without the others."""
     count = len(table.commands)
     poor = (plain.rms > 0.3 * table.width).any()
-    if table.sensed or not poor or count > _MOST_ROWS:
+    if not poor or count > _MOST_ROWS:
         return []
-    kinds = []
+    kinds, sensed = [], table.model.fitting.sensed
+    moved = np.delete(table.commands, sensed, axis=1)
+    read = np.hstack([table.measured, table.commands[:, sensed]])
     # As levels, of which many rows have one; by chance noise is in no order.
-    commands, readings = in_order(table.commands, 0.1), in_order(table.measured, 0.7)
+    commands, readings = in_order(moved, 0.1), in_order(read, 0.7)
     if commands.all() and readings.all():  # what depends on one command and bends
         return []
     if commands.any():
@@ -354,8 +386,10 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
         kinds.append(("readings sorted", 5.0 * np.log(count)))
     if not kinds:
         return []
-    expected = dataclasses.replace(table, theta=table.mean)
-    fits = [_matched(table, match) for match in matched_anew(expected, plain)]
+    fits = [] if table.alike is None else [_matched(table, table.alike)]
+    if not table.sensed:
+        expected = dataclasses.replace(table, theta=table.mean)
+        fits += [_matched(table, match) for match in matched_anew(expected, plain)]
     return [
         fit._replace(
             hypothesis=dataclasses.replace(fit.hypothesis, kind=kind, code=code),
@@ -369,9 +403,10 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
 def _matched(table: Table, match: Rows) -> Fitted:
     """An assignment that is refined in turn with its fit."""
     hypothesis, every = Hypothesis("sorted", match), np.arange(len(match))
+    table = _anew(table, hypothesis, every) or table
     fit = fitted(table, hypothesis)
     for _ in range(_TURNS):
-        match = assigned(table, fit, every)
+        match = assigned(fit, every)
         if (match == fit.hypothesis.match).all():
             break
         fit = fitted(table, dataclasses.replace(hypothesis, match=match), fit.theta)
@@ -386,7 +421,7 @@ def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
 
     every = np.arange(len(table.commands))
     if not table.free.any():
-        return [assigned(table, fit, every)]
+        return [assigned(fit, every)]
     factors, right = table.system(as_it_is(table), every)
     (count, a, r), c = factors.shape, right.shape[-1]
     read = (table.measured / table.scale).reshape(count, -1)

@@ -6,7 +6,6 @@ and after.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -149,13 +148,16 @@ def _of_all_rows(table: Table, fast: bool) -> list[Hypothesis]:
     rows = np.arange(count)
     alike = [as_it_is(table), Hypothesis("reversed", rows[::-1], _KINDS)]
     most = min(_LAGS, count // 3) if fast else 3
-    for by in itertools.chain(range(1, most + 1), range(-most, 0)):
+    lags, half = {*range(1, most + 1), *range(-most, 0)}, count // 2
+    turns = {*range(1, count)} if fast and count <= _EDGES else {half, count - half}
+    if table.alike is not None:  # by how many rows most are apart
+        turn = int(np.bincount((table.alike - rows) % count).argmax())
+        lags, turns = lags | {turn, turn - count}, turns | {turn}
+    for by in sorted(lags - {0}):
         if abs(by) < count - _LEAST:
             code = _KINDS + np.log(6.0 if abs(by) <= 3 else 2.0 * count)
             alike.append(Hypothesis("shift", shifted(count, by), code, ((0, by),)))
-    half = count // 2
-    turns = range(1, count) if fast and count <= _EDGES else {half, count - half}
-    for by in turns:  # a lag, whose first or last rows are at the other end
+    for by in sorted(turns - {0}):  # a lag, its rows at the other end
         halves = by in (half, count - half)
         near = min(by, count - by) <= 3
         code = _KINDS + np.log(2.0 if halves else 6.0 if near else count)

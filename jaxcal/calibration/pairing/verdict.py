@@ -101,7 +101,7 @@ def _outliers_of(fit: Fit, table: Table, outputs: list[int]) -> Reason | None:
     readings = (table.measured / table.scale)[rows]
     steps = resolution(fit.measured, COARSE)[outputs]
     noise = np.hypot(plain.noise, steps / table.scale)
-    away = np.abs(readings - predicted(table, plain)[rows]) / noise
+    away = np.abs(readings - predicted(plain)[rows]) / noise
     away, benign = away.max(axis=1), benign_fits(table, plain, plain)
     rows = rows[away >= _OFF]
     if not len(rows) or max(x.evidence for x in benign) > plain.evidence:
