@@ -521,6 +521,35 @@ def test_views_of_a_board_that_lost_their_order_or_one_of_them(example):
     assert lost.reason.startswith("from row 14 on, readings are one row early")
 
 
+@pytest.mark.parametrize("example", [fr3, positioner])
+@pytest.mark.parametrize(
+    ("columns", "factors", "words"),
+    [
+        ([0, 1, 2], (1, -1, 1, 1, 1, 1), "{1} has the other sign"),
+        ([0, 1, 2], (1, 1, 1, 1, 1, -1), "{5} has the other sign"),
+        ([1, 0, 2], (1, 1, 1, 1, 1, 1), "{0} and {1} are exchanged"),
+        ([0, 1, 2, 4, 3], (1, 1, 1, 1, 1, 1), "{3} and {4} are exchanged"),
+        ([0, 1, 2], (1e3, 1e3, 1e3, 1, 1, 1), "{0} to {2}: each is too large by 1000"),
+        (
+            [0, 1, 2],
+            (1, 1, 1, *[np.pi / 180] * 3),
+            "{3} to {5}: each is in radians instead of degrees",
+        ),
+    ],
+)
+def test_columns_of_a_pose_that_was_seen(example, columns, factors, words):
+    views, joints = _views(example)[:20], example.arm().num_joints
+    order = [*columns, *range(len(columns), 6)]
+    views[:, joints:] = views[:, joints:][:, order] * factors
+    numbered = [f"u_{joints + i + 1}" for i in range(6)]
+    try:
+        told = _verdict(views, np.zeros((20, 6)), model=example.arm())
+        reason, names = told.mispairing.reason, numbered
+    except ValueError as error:  # before there is a calibration
+        reason, names = str(error), example.arm().inputs[joints:] or numbered
+    assert reason.startswith(words.format(*names))
+
+
 @pytest.mark.parametrize("name", ["panda_1", "kuka_14"])
 def test_contacts_beside_other_sockets(name):
     """Readings are zero: which socket is touched is what may be mispaired."""

@@ -303,9 +303,11 @@ class Board(Sensor):
 def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Array]:
     """How far off the views are, the place Z and the tool X of ``A X = Z B``.
 
-    The median of turns in radians and shifts in lengths of the arm, inf where the views
-    do not determine them. Views four times as far off are left out.
+    The median of turns in radians and shifts in lengths of the arm, or in what the
+    views spread over if that is less; inf where the views do not determine them. Views
+    four times as far off are left out.
     """
+    length = min(tip.length or 1.0, float(np.linalg.norm(shift.std(axis=0))) or 1.0)
     place, new = np.eye(4), np.eye(4)
     used, off = np.ones(len(turn), dtype=bool), np.full(len(turn), np.inf)
     for _ in range(5):
@@ -332,7 +334,7 @@ def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Ar
         apart = tip.rotation @ shifts[:3] + tip.position - shift @ stand.T - shifts[3:]
         trace = np.einsum("nij,nij->n", tip.rotation @ tool, stand @ turn)
         off = np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
-        off = off + np.linalg.norm(apart, axis=1) / (tip.length or 1.0)
+        off = off + np.linalg.norm(apart, axis=1) / length
         kept = off <= 4.0 * np.median(off)
         if (kept == used).all() or kept.sum() < 3:
             break

@@ -44,6 +44,7 @@ _TURNED = 0.05  # turns, at least, of commands that may be in counts
 _ALIKE, _MULTIPLE = 1.1, 0.05  # of factors; of the readings' squares, that is left
 _DECADES = {0.01, 0.1, 10.0, 100.0}  # by which a nominal may be off
 _COLUMNS = 6  # changes of columns that are fitted one by one
+_NEAREST = 24  # of them that are located, where views show turns
 _MOST = 30  # columns that are tried one by one
 _PLACES = 2  # of a sensor, that are tried
 _KINDS = np.log(10.0)
@@ -70,7 +71,10 @@ def changed_columns(
     tables, every = [], np.flatnonzero(table.counted)
     theta = table.theta if not table.free.any() else table.mean
     expected = None if table.model.linear and table.free.any() else theta
-    for hypothesis in _kinds_of_columns(table, inputs, outputs, expected):
+    kinds = _kinds_of_columns(table, inputs, outputs, expected)
+    if table.sensed and table.alike is not None:
+        kinds = sorted(kinds, key=lambda x: _apart(table, x, every))[:_NEAREST]
+    for hypothesis in kinds:
         anew = _anew(table, hypothesis, every)
         with contextlib.suppress(ValueError):  # the number of a chain has no sign
             if anew is not None:
@@ -171,6 +175,16 @@ def _kinds_of_columns(
             kinds.append((f"{both} are exchanged", [i, j], 1.0))
             if not of_readings:
                 kinds.append((f"{both} have the wrong sign", [i, j], -1.0))
+        seen = range(count, len(names) if table.alike is not None else 0)
+        for i in seen:  # of a pose that a reading brought, its place and its turn
+            kinds.append((f"{names[i]} has the other sign", [i], -1.0))
+            for j in range(i + 1, count + 3 + (i - count) // 3 * 3):
+                both = f"{names[i]} and {names[j]}"
+                kinds.append((f"{both} are exchanged", [i, j], 1.0))
+        for k, (what, factor) in enumerate([*_UNITS.items()][:4] if seen else ()):
+            i = seen[0] if k > 1 else seen[3]  # a length, or a turn
+            words = f"{names[i]} to {names[i + 2]}: each {what}"
+            kinds.append((words, [i, i + 1, i + 2], factor))
         for words, columns, factor in kinds:
             order, factors = np.arange(len(names)), np.ones(len(names))
             factors[columns] = factor
@@ -210,6 +224,15 @@ def _multiple(table: Table, theta: Array) -> float:
     most = _FACTOR if table.model.fitting.off_by is None else _FACTOR_STATED
     near_unit = (apart < np.log(most)).all(axis=1).any()
     return 0.0 if near_unit else float(np.median(times))
+
+
+def _apart(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
+    """How far rows are from one another by commands and not by readings, or the other
+    way round; the median."""
+    columns = table.commands_of(hypothesis, rows), table.readings_of(hypothesis, rows)
+    gaps = table.model.fitting.apart(*columns)
+    assert gaps is not None
+    return float(np.median(np.abs(gaps[0] - gaps[1])))
 
 
 def _left_over(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
