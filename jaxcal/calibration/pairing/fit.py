@@ -44,15 +44,21 @@ class ColumnChange:
     order: tuple[int, ...]  # column i is the table's order[i]
     factors: tuple[float, ...]  # times this
     estimated: bool = False  # the factors, from the readings
+    seen: tuple[float, ...] = ()  # factors of columns that a reading brought
 
     def __call__(self, values: Array) -> Array:
         """(N, k) put right."""
         return values[:, self.order] * self.factors
 
     @property
+    def sizes(self) -> Array:
+        """(q,) what it makes of the size of the readings, () where it leaves them."""
+        return np.abs(self.factors if self.of_readings else self.seen)
+
+    @property
     def log_size(self) -> float:
-        """Log of what it makes of the size of a reading, of all outputs together."""
-        return float(np.log(np.abs(self.factors)).sum()) if self.of_readings else 0.0
+        """Log of that, of all outputs together."""
+        return float(np.log(self.sizes).sum())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -371,9 +377,9 @@ def judged(table: Table, hypothesis: Hypothesis, rows: Rows) -> Fitted:
     evidence = float(log_evidence(table, by_level, kept, extra)) - lost[best]
     evidence -= float(costs[unpaired].sum()) + hypothesis.code
     change, times = hypothesis.change, np.ones(q)
-    if change is not None and change.of_readings:
+    if change is not None and len(change.sizes):
         evidence += (kept - table.flat / q) * change.log_size
-        times = np.abs(np.array(change.factors))
+        times = change.sizes
     inside = np.zeros(len(table.commands), dtype=np.bool_)
     inside[rows[order[:kept]]] = True
     theta, free = table.theta.copy(), int(table.free.sum())

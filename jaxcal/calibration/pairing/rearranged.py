@@ -191,7 +191,8 @@ def _kinds_of_columns(
             if factor == 1.0:  # exchanged
                 order[columns] = columns[::-1]
             places = tuple(order.tolist()), tuple(factors.tolist())
-            changes.append(ColumnChange(words, of_readings, *places))
+            of_seen = places[1][count:] if seen else ()
+            changes.append(ColumnChange(words, of_readings, *places, seen=of_seen))
     if theta is not None and (times := _multiple(table, theta)):
         words = f"the readings are {times:.3g} times what the parameters say (counts?)"
         places = tuple(range(len(outputs))), (1.0 / times,) * len(outputs)
