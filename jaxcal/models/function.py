@@ -262,36 +262,38 @@ class FromFunction(FunctionModel):
             there = np.concatenate([at + move for move in moves])  # in one call of f
             return np.split(self._run([(there, theta)])[0], len(moves))
 
-        values = run(rows, enumerate(steps.sides))
-        sides = np.array([steps.sides] * len(rows), dtype=object).T
-        failed = np.asarray(np.isnan(np.array(values)).any(axis=(0, 2)))
+        values = np.array(run(rows, enumerate(steps.sides)))
+        sides = np.array([[*STENCILS].index(side) for side in steps.sides])
+        sides = np.repeat(sides[:, None], len(rows), axis=1)
+        failed = np.asarray(np.isnan(values).any(axis=(0, 2)))
         if failed.any():  # at an edge of what f takes?
             failed[failed] = ~np.isnan(self.predict(rows[failed], theta)).any(axis=1)
             for j in range(len(steps.steps)):
                 its = values[4 * j : 4 * j + 4]
                 for side in ("forward", "backward"):
-                    lost = failed & np.isnan(np.array(its)).any(axis=(0, 2))
+                    lost = failed & np.isnan(its).any(axis=(0, 2))
                     if lost.any():
-                        tried = run(rows[lost], [(j, side)])
-                        for old, new in zip(its, tried, strict=True):
-                            old[lost] = new
-                        sides[j, lost] = side
+                        its[:, lost] = run(rows[lost], [(j, side)])
+                        sides[j, lost] = [*STENCILS].index(side)
         return self._slopes(steps, rows, values, sides)
 
     def _slopes(
         self,
         steps: Differences,
         rows: Array,
-        values: list[Array],
-        sides: NDArray[np.object_],
+        values: Array,
+        sides: NDArray[np.intp],
     ) -> Array:
-        """(N, q, p) of 4 p values (N, q), by ``sides`` (p, N)."""
+        """(N, q, p) of values (4 p, N, q), by ``sides`` (p, N), numbers of stencils."""
         slopes = np.empty((*values[0].shape, len(steps.steps)))
         rough = np.empty_like(slopes)
         for j, step in enumerate(steps.steps):
-            stack = np.array(values[4 * j : 4 * j + 4])
-            for side in {*sides[j]}:
-                at, stencil = sides[j] == side, STENCILS[side]
+            stack = values[4 * j : 4 * j + 4]
+            for side, stencil in enumerate(STENCILS.values()):
+                at: Any = sides[j] == side
+                if not at.any():
+                    continue
+                at = slice(None) if at.all() else at
                 weights = np.array([stencil.fine, stencil.coarse]) / step
                 fine, coarse = combined(stack[:, at], weights, self.periods)
                 slopes[at, :, j], rough[at, :, j] = fine, coarse

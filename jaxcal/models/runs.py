@@ -12,6 +12,7 @@ import pickle
 import shlex
 import shutil
 import subprocess
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from typing import Any
@@ -26,6 +27,7 @@ Job = tuple[Array, Array]  # commands (N, n) and parameters (p,)
 Answer = tuple[Array, dict[int, str]]
 
 _TASKS_EACH = 4  # pieces of work for each process, so that none waits long
+_SOON = 0.05  # seconds: more rows are run at once, before progress is told
 _TASKS = 256  # of an executor, whose size is not known
 
 
@@ -152,7 +154,7 @@ class Runs:
         total = sum(len(rows) for rows, _ in jobs)
         size = max(1, -(-total // self._num_tasks))
         if self.processes == 1:
-            size = max(total, 1) if self.batch else 1
+            size = max(total, 1)
         return [
             (j, slice(first, min(first + size, len(rows))))
             for j, (rows, _) in enumerate(jobs)
@@ -163,9 +165,17 @@ class Runs:
         self, jobs: Sequence[Job], pieces: list[tuple[int, slice]]
     ) -> Iterator[tuple[tuple[int, slice], Answer]]:
         if self.processes == 1:
+            size = 1
             for j, rows in pieces:
-                commands, parameters = jobs[j]
-                yield (j, rows), _answer(self.f, self.batch, commands[rows], parameters)
+                (commands, parameters), first = jobs[j], 0
+                while first < rows.stop:
+                    part = slice(first, rows.stop if self.batch else first + size)
+                    begun = time.perf_counter()
+                    result = _answer(self.f, self.batch, commands[part], parameters)
+                    if time.perf_counter() - begun < _SOON:
+                        size *= 2
+                    first += len(commands[part])
+                    yield (j, slice(part.start, first)), result
             return
         try:
             broken: list[tuple[int, slice]] = []
@@ -246,18 +256,18 @@ def _answer(
             return _readings(result, len(commands)), {}
     rows: list[Array] = []
     why: dict[int, str] = {}
-    for i, command in enumerate(commands):
-        argument = command[None] if batch else command
-        try:
-            with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):
+        for i, command in enumerate(commands):
+            argument = command[None] if batch else command
+            try:
                 result = f(argument.copy(), parameters.copy())
-        except Exception as error:
-            name = "" if isinstance(error, _RunError) else f"{type(error).__name__}: "
-            why[i] = f"{name}{error}".splitlines()[0]
-            continue
-        rows.append(_readings(result, 1 if batch else 0)[0])
-        if len(rows[-1]) != len(rows[0]):
-            raise ValueError(_of_shape(len(rows[0]), rows[-1], command))
+            except Exception as error:
+                kind = "" if isinstance(error, _RunError) else type(error).__name__
+                why[i] = f"{kind}: {error}".removeprefix(": ").splitlines()[0]
+                continue
+            rows.append(_readings(result, 1 if batch else 0)[0])
+            if len(rows[-1]) != len(rows[0]):
+                raise ValueError(_of_shape(len(rows[0]), rows[-1], command))
     return np.array(rows), why
 
 
