@@ -699,6 +699,24 @@ def test_a_shift_of_a_grid_in_order_is_named_beside_the_reverse(levels, by):
         assert fit.verdict.next_step.startswith("find out which it is")
 
 
+@pytest.mark.parametrize("inputs, levels, repeats", [(2, 2, 3), (3, 4, 2), (1, 3, 2)])
+def test_what_bends_on_a_grid_in_order_is_no_shift(inputs, levels, repeats, rng):
+    """A product's signs are those of a column, some rows further."""
+    axes = [np.arange(levels) - (levels - 1) / 2.0] * inputs
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, inputs)
+    u = np.repeat(grid, repeats, axis=0)
+    y = (u.prod(axis=1) if inputs > 1 else u[:, 0] ** 2)[:, None] * [1.3, -0.4]
+    fit = _verdict(u, y + 0.01 * rng.normal(size=y.shape))
+    assert not fit.verdict.good and fit.mispairing is None
+
+
+def test_a_check_of_few_levels_names_a_sign_though_a_curve_explains_it(rng):
+    levels = rng.choice([-1.0, 0.0, 1.0], (100, 3)) + BIAS
+    y = levels @ MATRIX.T + BIAS + 0.01 * rng.normal(size=levels.shape)
+    told = _verdict(levels, y).check(levels * [1.0, -1.0, 1.0], y)
+    assert told.mispairing.startswith("u_y has the other sign")
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_many_rows_of_which_one_output_stands_still_divide_by_no_zero(rng):
     u = rng.uniform(-1.0, 1.0, (800, 2))

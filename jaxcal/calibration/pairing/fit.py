@@ -420,7 +420,7 @@ def top(fits: list[Fitted], count: int) -> list[Fitted]:
     return sorted(fits, key=lambda fit: -fit.evidence)[:count]
 
 
-def _as_before(best: Fitted) -> bool:
+def as_before(best: Fitted) -> bool:
     """Whether columns put right leave what a calibration's noise was, which is the unit
     here: no machine changes as by a sign, a unit or a place."""
     change = best.hypothesis.change
@@ -442,6 +442,8 @@ def benign_fits(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
     n = commands.shape[1]
     i, j = np.triu_indices(n)
     squares = commands[:, i] * commands[:, j]
+    products = [*squares.T, *([commands.prod(axis=1)] if n > 2 else [])]
+    extras += [product[:, None] for product in products]  # one by one, of few rows
     cubes = np.hstack([squares[:, i == j], commands**3])
     terms = [squares, cubes, np.hstack([cubes, time])]
     if best.hypothesis.kind in SESSIONS:  # a drift that turns
@@ -458,7 +460,7 @@ def benign_fits(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
         ones = np.ones((count, 1))
         extras = [np.hstack([ones, extra]) for extra in extras]
     fits = [plain, *fits_of(at, [as_it_is(table, extra) for extra in extras])]
-    if not (table.free.any() or _as_before(best)):
+    if not (table.free.any() or as_before(best)):
         for more in (ones, np.hstack([ones, commands])):
             code = more.shape[1] * float(np.log(table.width).sum())
             fits += fits_of(at, [as_it_is(table, more, code)])

@@ -23,6 +23,7 @@ from jaxcal.calibration.pairing.fit import (
     Hypothesis,
     Names,
     Table,
+    as_before,
     as_it_is,
     benign_fits,
     fits_of,
@@ -317,10 +318,11 @@ def _of_all(
     if not better(plain, best):
         return None
     if best.hypothesis.kind != _APART:
+        far = _SURE if not table.free.any() and as_before(best) else _FAR
         for benign in benign_fits(table, plain, best):
             ahead = best.evidence - benign.evidence
             by_itself = benign is not plain and not benign.hypothesis.code
-            close = ahead < _FAR or best.hypothesis.kind in SESSIONS
+            close = ahead < far or best.hypothesis.kind in SESSIONS
             if ahead < _SURE_BESIDE:
                 return None
             if by_itself and close and not better(benign, best, _BENIGN):

@@ -392,6 +392,8 @@ def exchanged(table: Table, plain: Fitted) -> list[Fitted]:
 
 def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
     """Commands or readings that were sorted without the others."""
+    from scipy.special import gammaln
+
     count = len(table.commands)
     poor = (plain.rms > 0.3 * table.width).any()
     if not poor or count > _MOST_ROWS:
@@ -399,12 +401,13 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
     kinds, sensed = [], table.model.fitting.sensed
     moved = np.delete(table.commands, sensed, axis=1)
     read = np.hstack([table.measured, table.commands[:, sensed]])
-    # As levels, of which many rows have one; by chance noise is in no order.
-    commands, readings = in_order(moved, 0.1), in_order(read, 0.7)
+    # Commands may be of few levels; by chance noise is in no order.
+    commands, readings = in_order(moved, 1.0 / count), in_order(read, 0.7)
     if commands.all() and readings.all():  # what depends on one command and bends
         return []
     if commands.any():
-        code = 2.3 + float(np.log(np.arange(1, count + 1)).sum())
+        alike = np.unique(moved, axis=0, return_counts=True)[1]  # rows of one command
+        code = 2.3 + float(gammaln(count + 1.0) - gammaln(alike + 1.0).sum())
         kinds.append(("commands sorted", code))
     if readings.any():
         kinds.append(("readings sorted", 5.0 * np.log(count)))
