@@ -565,6 +565,9 @@ def test_contacts_beside_other_sockets(name):
     lost = np.hstack([joints[:-1], np.delete(sockets, 9, axis=0)])
     told = _verdict(lost, zeros[1:], model=model).mispairing
     assert "one row early" in told.reason
+    in_radians = joints * [np.pi / 180, *[1.0] * (joints.shape[1] - 1)]
+    with pytest.raises(ValueError, match=f"^{model.inputs[0]} is in radians instead"):
+        _verdict(np.hstack([in_radians, sockets]), zeros, model=model)
 
 
 def test_contacts_that_an_arm_at_rest_would_fit_better_are_left_alone():

@@ -315,7 +315,8 @@ def _of_all(
         best = next(as_good, best)
     if best.evidence - plain.evidence <= _SURE:
         best = next((fit for fit in fits if fit.hypothesis.kind == _APART), best)
-    if not better(plain, best):
+    size = np.maximum(plain.rms, plain.noise)  # rms is less, where a prior is known
+    if not better(plain._replace(rms=size), best):
         return None
     if best.hypothesis.kind != _APART:
         far = _SURE if not table.free.any() and as_before(best) else _FAR

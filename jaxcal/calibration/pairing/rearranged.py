@@ -149,7 +149,8 @@ def _kinds_of_columns(
     read = table.measured.any() or table.alike is not None
     if table.measured.any() and not table.model.fitting.relative:
         tables.append((outputs, len(outputs), True))
-    ways = {"has the other sign": -1.0} | (_UNITS if read else {})
+    larger = {what: factor for what, factor in _UNITS.items() if factor > 1.0}
+    ways = {"has the other sign": -1.0} | (_UNITS if read else larger)
     changes: list[ColumnChange] = []
     for names, count, of_readings in tables:
         kinds: list[tuple[str, list[int], float]] = []  # words, columns and factor
