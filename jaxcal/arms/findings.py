@@ -82,13 +82,16 @@ def findings_of(
         swapped |= _swapped(fit, part, scatter is None)
     exchanged = [line for part in parts for line in _exchanged(fit, part)]
     limit = _LOOSE if len(used) > _SPARSE else 0.0
+    usual = np.asarray(model.default_noise().std)  # of the sensor, or as was said
     of_noise = scatter is not None and fit.noise_known  # all rows are far off
     outliers = [] if of_noise else [*fit.outliers]
     contradicting: list[int] = []
     reasons = _wrong_rows(fit, used, parts, swapped, outliers)
     if scatter:
         reasons.insert(0, scatter.fact)
-    if swapped or exchanged or (fit.distance[outliers] > limit**2).any():
+    far = fit.distance[outliers] > limit**2
+    far &= (np.abs(fit.residuals[outliers]) > limit * usual).any(axis=1)
+    if swapped or exchanged or far.any():
         reasons.insert(0, "some readings contradict the others")
         contradicting = sorted({*swapped, *outliers})
     moved = {part.kind: _moved(fit, part, swapped) for part in parts}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import warnings
 
+import fr3
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -54,6 +56,20 @@ def _of_a_panda(moves):
     exact = SerialChain.from_urdf(path, tip="ball_link")
     joints = np.clip(joints, *(exact.limits.T * 0.99))
     return path, _seen(exact, joints, moves)
+
+
+def test_a_view_that_the_sensor_may_have_read_is_named_and_the_others_used():
+    """Real views; the one that is farthest off is so by four of the sensor's noises."""
+    views = fr3.load()[[*range(19), 113]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        right = jaxcal.identify(views, np.zeros((20, 6)), model=fr3.arm())
+        views[19, 9] += 0.02  # along the view
+        wrong = jaxcal.identify(views, np.zeros((20, 6)), model=fr3.arm())
+    assert list(right.outliers) == [19] and right.verdict.good
+    assert any("19 is an outlier" in reason for reason in right.verdict.reasons)
+    assert wrong.verdict.reasons[0] == "some readings contradict the others"
+    assert not wrong.verdict.good and "row 19" in wrong.verdict.next_step
 
 
 @pytest.mark.parametrize(("moves", "truth"), [("camera", MOUNT), ("board", STAND)])
