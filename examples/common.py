@@ -12,6 +12,7 @@ import csv
 import importlib
 import pathlib
 import sys
+import warnings
 from collections.abc import Iterable
 from types import ModuleType
 from typing import Any
@@ -38,6 +39,8 @@ def main(example: ModuleType, arguments: list[str] | None = None) -> Any:
     parser.add_argument("--full", action="store_true", help="as many as in the table")
     parser.add_argument("--out", type=pathlib.Path, help="write NAME.csv and .png here")
     options = parser.parse_args(arguments)
+    # Of fits of too few readings, on purpose, and of readings far from them.
+    warnings.simplefilter("ignore", jaxcal.CalibrationWarning)
     found = example.study(options.full)
     rows: Rows = example.rows(found)
     print(markdown(rows))

@@ -12,7 +12,8 @@ from typing import Any
 
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.identify import identify
-from jaxcal.calibration.verdict import CalibrationWarning, Verdict
+from jaxcal.calibration.reasons import CalibrationWarning
+from jaxcal.calibration.verdict import Verdict
 
 __all__ = [
     "Budget",

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxcal.calibration.reasons import warn
 from jaxcal.calibration.resolution import COARSE, resolution
 from jaxcal.checks import Array, Mask, array_of, numbers
 from jaxcal.information.singular import depends
@@ -439,8 +439,9 @@ def say_far(
             )
         count = len(values)
     if far:
-        warnings.warn(
+        warn(
             f"{len(far)} of {count} {what}s {'is' if len(far) == 1 else 'are'} far "
             f"outside the measurements, where the calibration is untested: {worst}",
-            stacklevel=stacklevel,
+            f"{what}s are far outside the measurements",
+            stacklevel,
         )

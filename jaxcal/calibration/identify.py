@@ -9,7 +9,6 @@ import hashlib
 import json
 import platform
 import sys
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,7 +19,7 @@ from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.fit import outputs_at, stated_prior
 from jaxcal.calibration.fit_model import fit_model, fitted_again, require_fitting
 from jaxcal.calibration.pairing import of_unfitted
-from jaxcal.calibration.verdict import CalibrationWarning
+from jaxcal.calibration.reasons import warn
 from jaxcal.checks import (
     Array,
     array_of,
@@ -171,9 +170,7 @@ def identify(
     unchecked = calibration.noise_std is None and calibration.dof < 0.5
     exact = unchecked and calibration.affine is not None
     if not exact and not calibration.verdict.good:
-        warning = CalibrationWarning(str(calibration.verdict))
-        warning.new = True
-        warnings.warn(warning, stacklevel=2)
+        warn(str(calibration.verdict), "not good", stacklevel=2)
     return calibration
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -14,6 +12,7 @@ from jaxcal.calibration.fit import (
     say_far,
     unseen_directions,
 )
+from jaxcal.calibration.reasons import warn
 from jaxcal.checks import Array, Mask, array_of, in_words
 from jaxcal.information.singular import (
     depends,
@@ -264,7 +263,7 @@ class _Search(Responses):
         if clipped:
             some = "; ".join(clipped[:_NAMED]) + "; ..." * (len(clipped) > _NAMED)
             count = f"{len(clipped)} of {len(commands)} targets are clipped"
-            warnings.warn(f"{count}: {some}", stacklevel=3)
+            warn(f"{count}: {some}", "targets are clipped", stacklevel=3)
 
     def say_far(self, commands: Array) -> None:
         """Warn of targets that are reached (P, n) far from what was measured."""

@@ -70,20 +70,6 @@ class Verdict:
     _repr_html_ = late("jaxcal.reports.shown:as_html")
 
 
-class CalibrationWarning(UserWarning):
-    """A calibration is not good; the text is its verdict.
-
-    Python shows the first for each line that calls ``identify``, whatever it says, and
-    none after ``warnings.simplefilter("ignore", jaxcal.CalibrationWarning)``.
-    """
-
-    new = False  # set where it is issued: Python has not looked at its text yet
-
-    def __str__(self) -> str:
-        # Python shows a text once for each line: at its first look all are the same.
-        return "not good" if vars(self).pop("new", False) else super().__str__()
-
-
 def left_out(fit: Fit) -> Array:
     """(N, m) residual of each measurement from the fit without it, to first order."""
     noise = noise_of(fit, "held-out errors")

@@ -25,9 +25,15 @@ import numpy as np, jaxcal
 rng = np.random.default_rng(0)
 for _ in range(5):
     jaxcal.identify(rng.normal(size=(20, 2)), rng.normal(size=(20, 2)))
+u = rng.normal(size=(20, 2))
+good = jaxcal.identify(u, u * [1.0, 0.9] + 0.01 * rng.normal(size=(20, 2)))
+for _ in range(5):
+    good.predict(100.0 * rng.normal(size=(20, 2)))
+    good.command_for(100.0 * rng.normal(size=(20, 2)), limits=[(-9, 9)] * 2, clip=True)
 warnings.simplefilter("ignore", jaxcal.CalibrationWarning)
 for _ in range(5):
     jaxcal.identify(rng.normal(size=(20, 2)), rng.normal(size=(20, 2)))
+    good.predict(100.0 * rng.normal(size=(20, 2)))
 """
 
 
@@ -258,8 +264,9 @@ def test_a_program_warns_once_and_can_be_told_to_be_quiet():
     run = subprocess.run(
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True
     )
-    assert run.stderr.count("CalibrationWarning") == 1
-    assert run.stderr.count("explains nothing") == 1
+    assert run.stderr.count("CalibrationWarning") == 4, run.stderr
+    for words in ("explains nothing", "commands are far", "targets are far", "clipped"):
+        assert run.stderr.count(words) == 1
 
 
 def test_the_text_of_a_warning_is_the_whole_verdict_wherever_it_is_read():
