@@ -501,7 +501,7 @@ def test_a_distance_from_one_hand_to_the_other_is_judged_by_both(apart, tmp_path
     robot, commands, measured = sharing("sockets", tmp_path)
     sensor = Socket(3, distances=[(0, 2, apart, 1e-4)])
     number = robot.stands[0][0]
-    given = robot.with_member(number, sensor)
+    given = robot._with_member(number, sensor)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         verdict = jaxcal.identify(commands, measured, model=given).verdict
