@@ -325,23 +325,19 @@ def anew(arm: Chain, commands: Array, measured: Array) -> Chain:
 
 
 def apart(arm: Chain, commands: Array, measured: Array) -> tuple[Array, Array] | None:
-    """By which angles the nominal tip turns from row to row, and what it holds as it is
-    seen: the same wherever camera and board are; of positions how far they are apart.
-    """
+    """Angles from row to row, by the nominal tip and as it is seen: alike wherever
+    camera and board are. Of positions, how far they are apart."""
     tip = arm.nominal_tip(commands)
     seen = arm.sensor.seen_poses(commands[:, arm.num_joints :], measured)
     if seen is not None:
-        both = [
-            0.5 * np.einsum("nij,mij->nm", turn, turn) - 0.5
-            for turn in (tip.rotation, seen[0])
-        ]
-        by_tip, by_view = np.arccos(np.clip(both, -1.0, 1.0))
+        turns = tip.rotation, seen[0]
+        twice = [np.einsum("nij,mij->nm", turn, turn) - 1.0 for turn in turns]
+        by_tip, by_view = np.arccos(np.clip(twice, -2.0, 2.0) / 2.0)
         return by_tip, by_view
     if not arm.sensor.positions:
         return None
     gaps = [x[:, None] - x for x in (tip.position, measured[:, :3])]
-    by_tip, by_reading = (np.linalg.norm(gap, axis=-1) for gap in gaps)
-    return by_tip, by_reading
+    return np.linalg.norm(gaps[0], axis=-1), np.linalg.norm(gaps[1], axis=-1)
 
 
 def located(

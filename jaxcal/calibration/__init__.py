@@ -12,8 +12,8 @@ from typing import Any
 
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.identify import identify
-from jaxcal.calibration.reasons import CalibrationWarning
 from jaxcal.calibration.verdict import Verdict
+from jaxcal.calibration.warning import CalibrationWarning
 
 __all__ = [
     "Budget",

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.calibration.reasons import warn
 from jaxcal.calibration.resolution import COARSE, resolution
+from jaxcal.calibration.warning import warn
 from jaxcal.checks import Array, Mask, array_of, numbers
 from jaxcal.information.singular import depends
 from jaxcal.models.identifiability import Identifiability, identifiability

@@ -12,7 +12,7 @@ from jaxcal.calibration.fit import (
     say_far,
     unseen_directions,
 )
-from jaxcal.calibration.reasons import warn
+from jaxcal.calibration.warning import warn
 from jaxcal.checks import Array, Mask, array_of, in_words
 from jaxcal.information.singular import (
     depends,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -22,27 +21,6 @@ _NAMED, _DIGITS = 6, 7  # rows in one sentence; decimals of a table
 _ENDS, _END_SHARE = 4, 0.15  # rows at the end of a sensor's range, at least
 _TWICE = 1.1  # rows of a value within it, in the mean, at most
 _FLAT = 0.05  # of the readings: a fit that moves less there is flat itself
-
-
-class CalibrationWarning(UserWarning):
-    """A calibration is not good, and why; or it is used far from its measurements.
-
-    Python shows the first of each kind for a line of a program, whatever it says, and
-    none after ``warnings.simplefilter("ignore", jaxcal.CalibrationWarning)``.
-    """
-
-    kind = ""
-
-    def __str__(self) -> str:
-        # Python shows a text once for each line: at its first look it is the kind.
-        return vars(self).pop("kind", "") or super().__str__()
-
-
-def warn(text: str, kind: str, stacklevel: int) -> None:
-    """Issue a CalibrationWarning of a kind, for which texts of calls differ."""
-    warning = CalibrationWarning(text)
-    warning.kind = kind
-    warnings.warn(warning, stacklevel=stacklevel + 1)
 
 
 class Reason(NamedTuple):

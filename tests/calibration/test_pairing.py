@@ -27,6 +27,7 @@ from jaxcal.calibration.pairing.fit import (
     log_evidence,
     shifted,
 )
+from jaxcal.calibration.pairing.judge import of_fit
 from jaxcal.commands import main
 from jaxcal.models import Affine, FromFunction, Linear
 
@@ -519,6 +520,19 @@ def test_views_of_a_board_that_lost_their_order_or_one_of_them(example):
     table = np.hstack([views[:19, :joints], np.delete(views, 14, axis=0)[:, joints:]])
     lost = _verdict(table, zeros[:19], model=example.arm()).mispairing
     assert lost.reason.startswith("from row 14 on, readings are one row early")
+
+
+def test_many_rows_are_not_compared_each_with_each():
+    joints, measured = ur5.load("ur5_grid_1000.csv")
+    few, many = (
+        dataclasses.replace(
+            of_fit(_verdict(joints[:20], measured[:20], model=ur5.arm())),
+            commands=joints[:count], measured=measured[:count],
+        )
+        for count in (20, 1000)
+    )  # fmt: skip
+    assert many.alike is None
+    np.testing.assert_array_equal(few.alike, np.arange(20))
 
 
 @pytest.mark.parametrize("example", [fr3, positioner])

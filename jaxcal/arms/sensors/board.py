@@ -307,7 +307,8 @@ def _hand_and_eye(tip: Tip, turn: Array, shift: Array) -> tuple[float, Array, Ar
     views spread over if that is less; inf where the views do not determine them. Views
     four times as far off are left out.
     """
-    length = min(tip.length or 1.0, float(np.linalg.norm(shift.std(axis=0))) or 1.0)
+    length, spread = tip.length or 1.0, float(np.linalg.norm(shift.std(axis=0)))
+    length = min(length, spread or length)
     place, new = np.eye(4), np.eye(4)
     used, off = np.ones(len(turn), dtype=bool), np.full(len(turn), np.inf)
     for _ in range(5):

@@ -32,6 +32,7 @@ _WAVES = 6  # half periods of a drift
 _FREEDOM = 4.0  # of Student's t, of the robust start
 _ROUNDS = 6  # of robust weights, and of linearising
 _TURNS = 12  # of matching
+MOST_ROWS = 150  # of a table whose lost order is looked for
 _RIDGE = 1e-11  # of a column's square: what no row excites stays at the prior's mean
 
 
@@ -108,9 +109,12 @@ class Table:
     def alike(self) -> Rows | None:
         """(N,) match by which rows are as far apart by readings as by commands,
         whatever the parameters: by each row's sorted distances first, then by those
-        from the rows that are matched. None where the model has no such distances."""
+        from the rows that are matched. None where the model has no such distances, or
+        of many rows: N^3 numbers are compared."""
         from scipy.optimize import linear_sum_assignment
 
+        if len(self.commands) > MOST_ROWS:
+            return None
         gaps = self.model.fitting.apart(self.commands, self.measured)
         if gaps is None:
             return None

@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import math
 
 import numpy as np
 
 from jaxcal.calibration.pairing.fit import (
+    MOST_ROWS,
     ColumnChange,
     Fitted,
     Hypothesis,
@@ -53,7 +55,6 @@ _ROWS = 50  # that are predicted in each unit
 # the readings' squares that a change leaves.
 _FACTOR, _FACTOR_STATED = 1.5, 1.2
 _LEFT_OVER, _AS_GOOD_SHARE = 0.6, 1e-4
-_MOST_ROWS = 150  # of a table whose lost order is looked for
 _STARTS, _REFINED, _ROUNDS = 12_000, 8, 12  # of that search: rows times starts, ...
 _SOLVED = 0.003  # share of the squares that the right order leaves
 _FAR = 1e9  # noises: what a model cannot predict
@@ -149,8 +150,8 @@ def _kinds_of_columns(
     read = table.measured.any() or table.alike is not None
     if table.measured.any() and not table.model.fitting.relative:
         tables.append((outputs, len(outputs), True))
-    larger = {what: factor for what, factor in _UNITS.items() if factor > 1.0}
-    ways = {"has the other sign": -1.0} | (_UNITS if read else larger)
+    units = {what: factor for what, factor in _UNITS.items() if read or factor > 1.0}
+    ways = {"has the other sign": -1.0} | units
     changes: list[ColumnChange] = []
     for names, count, of_readings in tables:
         kinds: list[tuple[str, list[int], float]] = []  # words, columns and factor
@@ -229,8 +230,7 @@ def _multiple(table: Table, theta: Array) -> float:
 
 
 def _apart(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
-    """How far rows are from one another by commands and not by readings, or the other
-    way round; the median."""
+    """Median of how far rows are apart on one side and not on the other."""
     columns = table.commands_of(hypothesis, rows), table.readings_of(hypothesis, rows)
     gaps = table.model.fitting.apart(*columns)
     assert gaps is not None
@@ -240,7 +240,7 @@ def _apart(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
 def _left_over(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
     """Log size of what least squares about ``theta`` leaves, of all outputs together,
     with how far it moves what a prior is known of."""
-    off, moved = _least_squares(table, hypothesis, rows)
+    off, moved = _residuals(table, hypothesis, rows)
     if table.levels == 1:
         size = 0.5 * table.outputs * float(np.log((off**2).sum() + moved + 1e-300))
     else:
@@ -250,9 +250,7 @@ def _left_over(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
     return size if size == size else np.inf
 
 
-def _least_squares(
-    table: Table, hypothesis: Hypothesis, rows: Rows
-) -> tuple[Array, float]:
+def _residuals(table: Table, hypothesis: Hypothesis, rows: Rows) -> tuple[Array, float]:
     """(K, q) residuals of least squares about ``theta``, and the prior's share."""
     slopes, right = table.system(hypothesis, rows)
     size, columns = len(rows) * slopes.shape[1], slopes.shape[2]
@@ -264,12 +262,11 @@ def _least_squares(
 
 
 def _distance(table: Table, hypothesis: Hypothesis, rows: Rows) -> float:
-    """Median log size of what is off before anything is fitted that a prior is known
-    of."""
+    """Median log size of what is off before what a prior is known of is fitted."""
     off = table.residuals(hypothesis, rows, table.theta)
     if table.flat:
         with contextlib.suppress(ValueError):
-            off = _least_squares(table, hypothesis, rows)[0]
+            off = _residuals(table, hypothesis, rows)[0]
     size = float(np.log(np.median(np.abs(off), axis=0) + 1e-300).sum())
     return size if size == size else np.inf
 
@@ -393,11 +390,9 @@ def exchanged(table: Table, plain: Fitted) -> list[Fitted]:
 
 def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
     """Commands or readings that were sorted without the others."""
-    from scipy.special import gammaln
-
     count = len(table.commands)
     poor = (plain.rms > 0.3 * table.width).any()
-    if not poor or count > _MOST_ROWS:
+    if not poor or count > MOST_ROWS:
         return []
     kinds, sensed = [], table.model.fitting.sensed
     moved = np.delete(table.commands, sensed, axis=1)
@@ -408,7 +403,7 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
         return []
     if commands.any():
         alike = np.unique(moved, axis=0, return_counts=True)[1]  # rows of one command
-        code = 2.3 + float(gammaln(count + 1.0) - gammaln(alike + 1.0).sum())
+        code = 2.3 + math.lgamma(count + 1.0) - sum(map(math.lgamma, alike + 1.0))
         kinds.append(("commands sorted", code))
     if readings.any():
         kinds.append(("readings sorted", 5.0 * np.log(count)))
