@@ -28,6 +28,7 @@ ROWS = (
     "startup",
     "memory",
     "scaling",
+    "records",
     "accelerator",
 )
 
@@ -47,6 +48,12 @@ def main() -> int:
         help="what each peer of the row training may take; 600",
     )
     parser.add_argument(
+        "--data",
+        type=pathlib.Path,
+        metavar="FOLDER",
+        help="the suites' own files (.mat, .cbf) for the row records",
+    )
+    parser.add_argument(
         "--out", type=pathlib.Path, default=pathlib.Path("runs/benchmark")
     )
     arguments = parser.parse_args()
@@ -61,7 +68,7 @@ def main() -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     kept = arguments.out / "results.json"
     results: dict[str, Any] = json.loads(kept.read_text()) if kept.exists() else {}
-    budget = Budget(arguments.quick, arguments.train_seconds)
+    budget = Budget(arguments.quick, arguments.train_seconds, arguments.data)
     failed = 0
     for name in arguments.only or ROWS:
         module = importlib.import_module(f"benchmarks.rows.{name}")

@@ -45,6 +45,7 @@ class Budget:
 
     quick: bool = False  # seconds a row: figures that only show that it runs
     train_seconds: float = 600.0  # of each peer in the row "training"
+    data: pathlib.Path | None = None  # folder of the suites' own files, for "records"
 
     def pick(self, full: int, quick: int) -> int:
         """A size: the full one, or the quick one."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -186,3 +188,49 @@ def test_the_row_of_the_accelerator_runs_on_what_is_there():
     assert all(line.value > 0.0 and line.unit for line in row.lines)
     updates = [line for line in row.lines if line.case.startswith("update")]
     assert all(float(line.note.split()[2]) > 0.0 for line in updates)  # its roofline
+
+
+def test_an_instance_of_e_is_read_from_the_conic_benchmark_format(tmp_path):
+    from benchmarks.suites import cbf
+
+    rows = np.array([[1.0, 2.0], [0.5, -1.0], [3.0, 0.0]])
+    entries = [
+        f"0 {i} {a} {b} {float(row[a] * row[b])}"
+        for i, row in enumerate(rows)
+        for a in range(2)
+        for b in range(a + 1)
+        if row[a] * row[b]
+    ] + ["0 3 0 0 -1", "0 3 1 1 -1"]
+    text = ["VER", "3", "OBJSENSE", "MAX", "VAR", "4 2", "L+ 3", "F 1", "INT", "3"]
+    text += ["0", "1", "2", "PSDCON", "1", "2", "OBJACOORD", "1", "3 1"]
+    text += ["CON", "4 2", "L= 1", "L- 3", "ACOORD", "6"]
+    text += ["0 0 1", "0 1 1", "0 2 1", "1 0 1", "2 1 1", "3 2 1"]
+    text += ["BCOORD", "4", "0 -3", "1 -2", "2 -1", "3 -2"]
+    text += ["HCOORD", str(len(entries)), *entries]
+    path = tmp_path / "small.cbf"
+    path.write_text("# written by hand\n" + "\n".join(text) + "\n")
+    one = cbf(path)
+    assert (one.name, one.criterion, one.size) == ("small", "E", 3)
+    assert one.most.tolist() == [2, 1, 2]
+    for read, row in zip(one.rows, rows, strict=True):
+        np.testing.assert_allclose(np.outer(read, read), np.outer(row, row), atol=1e-12)
+    path.write_text("VER\n3\nOBJSENSE\nMIN\nINT\n1\n0\nPSDCON\n1\n2\n")
+    with pytest.raises(ValueError, match="not a choice by the least eigenvalue"):
+        cbf(path)
+
+
+def test_entropy_is_a_choice_by_d():
+    from benchmarks.suites import covariance, entropy
+    from jaxcal import Design
+
+    matrix = covariance(None, 9)
+    one = entropy(matrix, 4)
+    chosen = Design.from_blocks(one.rows[:, None], prior=one.prior).select(
+        4, "D", "exact"
+    )
+    best = max(
+        np.linalg.slogdet(matrix[np.ix_(some, some)])[1]
+        for some in itertools.combinations(range(9), 4)
+    )
+    these = np.ix_(chosen.indices, chosen.indices)
+    assert np.linalg.slogdet(matrix[these])[1] == pytest.approx(best, abs=1e-10)

@@ -109,7 +109,7 @@ class Ascent:
             phi = float(self.phi(information))
             return self.soft(information, SHARP[-1] / self.unit(phi))[1]
         pairs = zip(self.problem.members, information, strict=True)
-        slopes = np.stack([_slope(member.criterion, one) for member, one in pairs])
+        slopes = np.stack([member.criterion.slope(one) for member, one in pairs])
         return slopes * (self.weights * self.scale)[:, None, None]
 
     def soft(self, information: Array, sharp: float) -> tuple[float, Array, float]:
@@ -133,7 +133,7 @@ class Ascent:
             else:
                 value = scale * float(criterion.value(one)) + self.shift[s]
                 values.append(np.array([value]))
-                metrics.append(scale * _slope(criterion, one)[None])
+                metrics.append(scale * criterion.slope(one)[None])
                 bounds.append(values[-1])
         terms = np.array(values)  # (S, p) or (S, 1)
         lowest = terms.min() if self.worst else terms.min(axis=1, keepdims=True)
@@ -223,19 +223,6 @@ def _filled(commands: Array) -> Array:
     """Commands and copies of the last up to a power of two: JAX compiles by number."""
     more = (1 << (len(commands) - 1).bit_length()) - len(commands)
     return np.concatenate([commands, np.repeat(commands[-1:], more, axis=0)])
-
-
-def _slope(criterion: Criterion, information: Array) -> Array:
-    """(p, p) gradient of the criterion by the information (p, p)."""
-    half = np.linalg.solve(information, criterion.root.T)  # M^-1 C.T
-    covariance = criterion.root @ half
-    if criterion.kind == "det":
-        return np.asarray(half @ np.linalg.solve(covariance, half.T))
-    if criterion.kind == "trace":
-        return np.asarray(half @ half.T)
-    values, vectors = np.linalg.eigh(covariance)
-    along = half @ vectors[:, -1]
-    return np.asarray(np.outer(along, along) / values[-1] ** 2)
 
 
 def climbed(ascent: Ascent, commands: Array) -> tuple[Array, float]:

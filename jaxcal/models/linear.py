@@ -356,7 +356,12 @@ class Polynomial(Linear):
         return {"kind": "polynomial"} | {key: getattr(self, key) for key in keys}
 
     def _features(self, commands: NDArray[Any]) -> NDArray[Any]:
-        return np.asarray(np.prod(commands[:, None, :] ** self._powers, axis=-1))
+        features = np.ones((len(self._powers), len(commands)), commands.dtype)
+        for term, row in zip(features, self._powers, strict=True):
+            for u, power in zip(commands.T, row, strict=True):
+                if power:
+                    term *= u if power == 1 else u**power
+        return np.ascontiguousarray(features.T)
 
 
 def input_letters(count: int) -> tuple[str, ...]:

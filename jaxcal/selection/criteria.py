@@ -137,6 +137,18 @@ class Criterion:
             phi = -np.linalg.slogdet(half @ np.matrix_transpose(half))[1]
         return np.where(regular, phi, -np.inf)
 
+    def slope(self, information: Array) -> Array:
+        """(p, p) gradient of phi by the information (p, p)."""
+        half = np.linalg.solve(information, self.root.T)  # M^-1 C.T
+        covariance = self.root @ half
+        if self.kind == "det":
+            return np.asarray(half @ np.linalg.solve(covariance, half.T))
+        if self.kind == "trace":
+            return np.asarray(half @ half.T)
+        values, vectors = np.linalg.eigh(covariance)
+        along = half @ vectors[:, -1]
+        return np.asarray(np.outer(along, along) / values[-1] ** 2)
+
     def reported(self, phi: Array | float) -> Array | float:
         """The value as the caller reads it."""
         if self.kind == "det":

@@ -14,7 +14,11 @@ cdef class Search:
     cdef double[::1] room  # which holds all that is a pointer below
     cdef int most_moved  # counts of a Newton step
     cdef bint lent  # the largest work space is that of a JointSearch
-    cdef double* blocks  # (M, q, p)
+    cdef double* blocks  # (M, q, p), as given or ``reduced``, where p is less
+    cdef double* given
+    cdef double* reduced
+    cdef int dimensions  # p of the blocks as given
+    cdef bint reducible
     cdef double* prior  # (p, p)
     cdef double* root  # C (s, p)
     cdef double* known  # (p, p) P, the prior and what the node has chosen
@@ -95,6 +99,7 @@ cdef class Search:
     cdef double _shared_out(self, int kind) noexcept nogil
     cdef void _bends(self) noexcept nogil
     cdef int _kind_of(self, const double* low) noexcept nogil
+    cdef void _reduce(self, int kind, const double* low, const double* high) noexcept nogil
     cdef void _weigh(self) noexcept nogil
     cdef bint _choose_mu(self, int place) noexcept nogil
     cdef int _best_place(self) noexcept nogil

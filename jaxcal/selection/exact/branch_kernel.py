@@ -41,6 +41,14 @@ U is at most (U - mu)+ + mu I, and I - inverse(I + H N H.T) is at most 1 and of 
 
 mu = 0 is the natural bound. At a given N the best mu is an eigenvalue of U, the first
 whose eigenvector no longer finds room among the t readings.
+
+Where the readings of open counts are fewer than the parameters, (7) works with rows L
+of the same inner products, ``L L.T = G = B H.T H B.T`` (9). A selection of t of them,
+each once, has with g the least eigenvalue of G
+
+    log det(I + G_S) = t log(1 + g) + log det(I + (G - g I)_S / (1 + g)),      (10)
+
+of which F bounds the last.
 """
 
 # Products may be fused.
@@ -86,6 +94,7 @@ _LATEST = declare(cython.int, 30)  # steps to a useful bound, time or not
 _FRACTIONAL = declare(cython.int, 400)  # counts that a Newton step moves at most
 _RIDGE = declare(cython.double, 1e-10)  # share of the largest curvature
 _ROUNDING = declare(cython.double, 1e-12)  # of a count that is whole
+_REDUCED = declare(cython.Py_ssize_t, 4_000_000)  # numbers of blocks held twice
 _TUNES = declare(cython.int, 2)  # of mu of RANK_TRACE in one node
 # b of E at first, where phi is about 1, and at most
 _SMOOTHING = declare(cython.double, 30.0)
@@ -165,6 +174,11 @@ class Search:
         self.triangle = p * (p + 1) // 2
         self.packed = take(at, self.triangle)
         self.squares = take(at, self.count * self.triangle if self.packs else 0)
+        fewer: cython.bint = self.kind == DET and not self.lent
+        size: cython.Py_ssize_t = self.count * self.q * p
+        self.reducible = fewer and size <= _REDUCED
+        self.reduced = take(at, size if self.reducible else 0)
+        self.given, self.dimensions = self.blocks, p
         return room - first
 
     def _pack(self, matrix, into, times):
@@ -192,7 +206,9 @@ class Search:
         self.watch = begin(seconds)
         low, high, c = self.node, self.node + self.count, self.node + 2 * self.count
         copy(low, address(begun[0, 0]), 3 * self.count)
-        bound = self._relax(self._kind_of(low), low, high, c, -1e300, 0.0)
+        kind = self._kind_of(low)
+        self._reduce(kind, low, high)
+        bound = self._relax(kind, low, high, c, -1e300, 0.0)
         copy(address(begun[2, 0]), c, self.count)
         return bound
 
@@ -338,10 +354,15 @@ class Search:
     def _shared_out(self, kind):
         """Bound F at N in the metric of P, slopes and base; f of A is -mu / (1 + l)."""
         p, values = self.p, self.values
-        multiply(False, False, p, p, p, self.half, self.rest, self.scaled)
-        multiply(False, True, p, p, p, self.scaled, self.half, self.vectors)
-        eigen(self.vectors, values, self.lapack, self.whole, p)
-        multiply(False, False, p, p, p, self.vectors, self.half, self.basis)
+        if p < self.dimensions:
+            copy(self.vectors, self.rest, p * p)
+            eigen(self.vectors, values, self.lapack, self.whole, p)
+            copy(self.basis, self.vectors, p * p)
+        else:
+            multiply(False, False, p, p, p, self.half, self.rest, self.scaled)
+            multiply(False, True, p, p, p, self.scaled, self.half, self.vectors)
+            eigen(self.vectors, values, self.lapack, self.whole, p)
+            multiply(False, False, p, p, p, self.vectors, self.half, self.basis)
         kept, places, rest, shares, logs = 0, self.places, 0.0, 0.0, 0.0
         for a in range(p):
             values[a] = max(values[a], 0.0)
@@ -391,6 +412,7 @@ class Search:
     def _kind_of(self, low):
         """Set P; RANK or RANK_TRACE where few readings are left to choose."""
         to_choose = self.k
+        self.blocks, self.p = self.given, self.dimensions
         self._sum(cython.NULL, low, self.prior, self.known)
         self.smoothing = _SMOOTHING
         for i in range(self.count):
@@ -407,6 +429,47 @@ class Search:
         self._weigh()
         sharper = self._choose_mu(self.p - 1 - self.places)
         return _RANK_TRACE if sharper else TRACE
+
+    def _reduce(self, kind, low, high):
+        """Let the open blocks of RANK be L until the next node, where it is smaller."""
+        q, p, m, top = self.q, self.dimensions, 0, 0.0
+        once: cython.bint = True
+        for i in range(self.count if kind == _RANK and self.reducible else 0):
+            if low[i] < high[i]:
+                if (m + 1) * q >= p:
+                    return
+                once = once and high[i] - low[i] == 1.0  # else it may be twice
+                self.open[m] = i
+                copy(self.picked + m * q * p, self.given + i * q * p, q * p)
+                m += 1
+        if m == 0:
+            return
+        self._turn(m, self.half, True)
+        r: cython.int = m * q
+        lower = self.reach
+        multiply(False, True, r, r, p, self.turned, self.turned, lower)  # G of (9)
+        for a in range(r):
+            top = max(top, lower[a * r + a])
+        self.places = min(self.places, r)
+        shift = 0.0
+        if once and q == self.rank:
+            copy(self.vectors, lower, r * r)
+            eigen(self.vectors, self.values, self.lapack, self.whole, r, False)
+            shift = max(self.values[0] - r * _EPS * top, 0.0)
+            for a in range(r):
+                lower[a * r + a] -= shift
+            self.constant += self.places * log1p(shift)  # (10)
+        cholesky(lower, lower, r, max(r * _EPS * top, 1e-300))
+        self.constant += 4.0 * r * _EPS * top
+        scale = 1.0 / sqrt(1.0 + shift)
+        for f in range(m):
+            for s in range(q):
+                a = f * q + s
+                row = self.reduced + (self.open[f] * q + s) * r
+                for b in range(r):
+                    row[b] = scale * lower[a * r + b] if b < a else 0.0
+                row[a] = scale / lower[a * r + a]
+        self.blocks, self.p = self.reduced, r
 
     def _weigh(self):
         """Fill ``weights`` and ``lines``: u and ``v.T inverse(H)``, by rows: ``C.T C``
@@ -847,6 +910,7 @@ class Search:
 
     def _gather_whole(self, counts):
         self.now = self.kind
+        self.blocks, self.p = self.given, self.dimensions
         self._sum(cython.NULL, counts, self.prior, self.gram)
 
     def _offer(self, counts):
@@ -952,7 +1016,9 @@ class Search:
         bound |d_i - cut| a unit, which tightens low and high (reduced-cost fixing)."""
         last = self.best_values.shape[0] - 1
         goal = self.best_values[last] + slack
-        bound[0] = self._relax(self._kind_of(low), low, high, c, goal, share)
+        kind = self._kind_of(low)
+        self._reduce(kind, low, high)
+        bound[0] = self._relax(kind, low, high, c, goal, share)
         if bound[0] <= goal:
             return -1
         room, total_low, total_high = self.linear - goal, 0.0, 0.0

@@ -22,6 +22,7 @@ from jaxcal.selection.exact.branch_and_bound import (
     Scenario,
     branch_and_bound,
 )
+from jaxcal.selection.exact.complement import complement
 from jaxcal.selection.exact.volume_kernel import descend
 from jaxcal.selection.exchange.exchange import (
     default_restarts,
@@ -181,9 +182,31 @@ def _branched(
     if (joint := problem.joint) is not None:
         terms = joint.terms()
         judged_by = JointScenarios(members, joint.criterion, joint.weights, terms)
+    elif problem.constraints is None:
+        return _of_sharper(members[0], *rules, **options)
     if problem.constraints is not None:
         options["rules"] = problem.constraints.of(keep)
     return branch_and_bound(judged_by, *rules, **options)
+
+
+def _of_sharper(
+    scenario: Scenario, lower: Indices, upper: Indices, start: Indices, **options: Any
+) -> BranchResult:
+    """Search the choice, or what is left out where its bound is sharper at first."""
+    bounds = lower, upper
+    other = complement(*scenario, *bounds, int(start.sum()))
+    if other is not None:
+        apart = Scenario(other.blocks, other.prior, other.criterion)
+        begun, ends = other.start(start), (0 * other.which, 0 * other.which + 1)
+        here = branch_and_bound(scenario, *bounds, start, root_only=True).bound
+        there = branch_and_bound(apart, *ends, begun, root_only=True).bound
+        if there + other.shift < here:
+            result = branch_and_bound(apart, *ends, begun, **options)
+            return dataclasses.replace(
+                result, counts=other.counts(result.counts),
+                values=result.values + other.shift, bound=result.bound + other.shift,
+            )  # fmt: skip
+    return branch_and_bound(scenario, *bounds, start, **options)
 
 
 def _pool(problem: Problem) -> tuple[Indices, bool]:

@@ -31,6 +31,9 @@ _FURTHER = (1.0, 0.03)
 _RANK_FIRST = 1e-7  # every direction that nothing is known of outweighs the rest
 _MENDING = 10  # random starts where all greedy ones are singular
 
+# Of more candidates than this, starts climb among some, chosen anew in each round.
+_MANY, _SOME, _ROUNDS = 20_000, 4_000, 8
+
 _CLIMBS = 2.5e5  # k p^3 of the climbs of E in one call, from each kind of start
 
 
@@ -247,6 +250,11 @@ def exchange_indices(
 ) -> Indices:
     """(k,) the best local optimum, required first; no more swaps after ``deadline``."""
     restarts = restarts or default_restarts(problem)
+    narrows = problem.joint is None and problem.criterion.kind != "least"
+    if narrows and np.count_nonzero(problem.upper) > _MANY and restarts > 1:
+        chosen = _narrowed(problem, restarts, seed, deadline)
+        if chosen is not None:
+            return chosen
     climbs = Climbs(problem, seed, deadline)
     if problem.criterion.kind == "least":
         chosen, phi = climbs.best_least(problem, restarts)
@@ -257,6 +265,37 @@ def exchange_indices(
             f"{problem.subject} allow no invertible selection: every start was singular"
         )
     return chosen
+
+
+def _narrowed(
+    problem: Problem, restarts: int, seed: int, deadline: Deadline
+) -> Indices | None:
+    """(k,) of many candidates. Each round starts among some, drawn at random and, after
+    the first, of the largest leverage at the mean information of the rounds before;
+    its best climbs among all. None where some identify nothing, or keep no rule."""
+    generator, usable = np.random.default_rng(seed), np.flatnonzero(problem.upper)
+    climbs, best, phi = Climbs(problem, seed, deadline), problem.required, -np.inf
+    strongest, information = problem.required, problem.prior
+    for number in range(1, _ROUNDS + 1):
+        few = generator.choice(usable, _SOME, replace=False)
+        few = np.unique(np.concatenate([few, strongest, problem.required]))
+        try:
+            start = exchange_indices(problem.among(few), restarts, seed, deadline)
+        except ValueError:
+            return None
+        chosen, value = climbs.climbed(few[start])
+        if value > phi:
+            best, phi = chosen, value
+        if deadline.passed:
+            break
+        rows = problem.blocks[chosen].reshape(-1, problem.num_regressors)
+        information = (
+            information + (rows.T @ rows + problem.prior - information) / number
+        )
+        slope = problem.criterion.slope(information)
+        leverage = np.vecdot(problem.blocks @ slope, problem.blocks).sum(axis=1)
+        strongest = usable[np.argpartition(-leverage[usable], _SOME)[:_SOME]]
+    return best if phi > -np.inf else None
 
 
 def fewest_regular(problem: Problem) -> Problem:

@@ -60,21 +60,28 @@ class Constraints:
         A ValueError where the search for them did not end."""
         from scipy import optimize
 
+        size = np.abs(self.costs).max(axis=1, keepdims=True, initial=1e-300)
+        cheapest, counts = (self.costs / size).sum(axis=0).argsort(), lower.copy()
+        room = (upper - lower)[cheapest]
+        before = np.cumsum(room) - room  # the cheapest together are often allowed
+        counts[cheapest] += (k - lower.sum() - before).clip(0, room)
+        if counts.sum() == k and not self.broken(counts):
+            return counts
         within = optimize.LinearConstraint(
             np.vstack([self.costs, np.ones(len(lower))]),
             np.append(np.full(len(self.most), -np.inf), k),
             np.append(self.most, k),
         )
-        counts = optimize.milp(
+        answer = optimize.milp(
             np.zeros(len(lower)), integrality=np.ones(len(lower)),
             bounds=optimize.Bounds(lower, upper), constraints=within,
             options={"time_limit": 60.0},
         )  # fmt: skip
-        if counts.status not in (0, 2):
+        if answer.status not in (0, 2):
             raise ValueError(
-                f"constraints could not be checked for a selection: {counts.message}"
+                f"constraints could not be checked for a selection: {answer.message}"
             )
-        return None if counts.x is None else np.rint(counts.x).astype(np.int64)
+        return None if answer.x is None else np.rint(answer.x).astype(np.int64)
 
 
 def checked_constraints(given: Any, count: int) -> Constraints | None:
@@ -213,6 +220,22 @@ class Problem:
     def of_size(self, k: int) -> Self:
         """This problem with k candidates to choose."""
         return dataclasses.replace(self, k=k)
+
+    def among(self, rows: Indices) -> Self:
+        """This problem with the candidates ``rows`` (N,) alone, ascending, the required
+        ones among them."""
+        times, rules, commands = self.max_replicates, self.constraints, self.candidates
+        return dataclasses.replace(
+            self,
+            white=self.white._replace(blocks=self.blocks[rows]),
+            available=self.available[rows],
+            required=np.searchsorted(rows, self.required),
+            max_replicates=times if isinstance(times, int) else times[rows],
+            raw=self.raw[rows],
+            readings=self.readings[rows],
+            candidates=None if commands is None else commands[rows],
+            constraints=None if rules is None else rules.of(rows),
+        )
 
     def values(self, indices: Indices) -> tuple[Array, Array]:
         """(R,) reported value of the criterion, and log det S, of subsets (R, k)."""
