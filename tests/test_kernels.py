@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -223,3 +224,54 @@ def test_kernels_are_for_the_processor_that_the_wheel_is_for(platform, flags, ex
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert done.stdout.strip() == expected
+
+
+SANITIZED = """
+    information/test_whitening.py models/test_serial_chain.py adaptive/test_fit_ahead.py
+    adaptive/test_lookahead.py selection/test_inference.py selection/test_exchange.py
+    selection/test_exact_criteria.py selection/test_exact_complement.py
+    selection/test_exact_few_readings.py selection/test_volume.py
+    selection/test_travel.py
+"""
+
+
+@pytest.mark.slow
+def test_sanitizers_of_addresses_and_undefined_behaviour_report_nothing(tmp_path):
+    """Every kernel, built with GCC's, under the quick tests that call it."""
+    libraries = [
+        subprocess.run(
+            ["gcc", f"-print-file-name={name}.so"], capture_output=True, text=True
+        ).stdout.strip()
+        for name in ("libasan", "libubsan")
+        if shutil.which("gcc")
+    ]
+    if not libraries or not all(pathlib.Path(path).is_absolute() for path in libraries):
+        pytest.skip("GCC's sanitizers are not on this machine")
+    for folder in ("jaxcal", "tests", "benchmarks", "examples"):
+        ignored = shutil.ignore_patterns("*.so", "__pycache__")
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=ignored)
+    for name in ("pyproject.toml", "hatch_build.py", "README.md"):
+        shutil.copy(ROOT / name, tmp_path)
+    flags = "-fsanitize=address,undefined -fno-omit-frame-pointer -g1"
+    subprocess.run(
+        [sys.executable, "hatch_build.py"], cwd=tmp_path, check=True,
+        env={**os.environ, "CC": "gcc", "CFLAGS": flags},
+    )  # fmt: skip
+    log = tmp_path / "report"
+    checked = {
+        "LD_PRELOAD": " ".join(libraries),
+        "ASAN_OPTIONS": f"detect_leaks=0:log_path={log}",
+        "UBSAN_OPTIONS": f"print_stacktrace=1:log_path={log}",
+        "PYTHONMALLOC": "malloc",
+        "PYTHONPATH": str(tmp_path),
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+    files = [f"tests/{name}" for name in SANITIZED.split()]
+    options = ["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "not slow"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *options, *files], cwd=tmp_path,
+        env={**os.environ, **checked}, capture_output=True, text=True,
+    )  # fmt: skip
+    reports = [path.read_text() for path in tmp_path.glob("report.*")]
+    assert not reports, "\n".join(reports)[:5000]
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

@@ -37,7 +37,7 @@ Keep what the reproduction report draws of training runs, finished or still goin
 metrics.csv, last_rewards.npy, summary.json and the weights, in a folder under --out
 for each.
 
-  python train.py --seed 3 --episodes 200000 --no-close-up \\
+  python train.py --seed 3 --episodes 200000 --with close_up=false \\
       --out runs/compact_seeds/seed_3
   python -m benchmarks.paper.training_runs runs/compact_seeds/* \\
       --out benchmarks/paper/kept/compact_seeds

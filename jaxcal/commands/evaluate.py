@@ -36,8 +36,8 @@ S*)^(1/p) of p parameters (D-eff.), det S over that of random selection (x rando
 _EPILOG = """\
 methods:
   policy              trained network; takes the most likely posture at every step
-  policy:samples      the best of --num random selections of the network
-  policy:first        the best after each of the --num most likely first postures
+  policy:samples      the best of 16 random selections of the network
+  policy:first        the best after each of the 16 most likely first postures
   policy:exchange     policy, then Fedorov exchange from its selection
   random              --draws selections per episode, all counted
   greedy              adds the posture of the largest gain, K times
@@ -141,7 +141,6 @@ class EvaluateOptions(Outputs):
     k: Annotated[int, "postures to choose", "K", (1,)] = 4
     episodes: Annotated[int | None, "at most the first N of each", (1,)] = None
     seed: Annotated[int, "seed of datasets and draws", "S", (0,)] = 0
-    num: Annotated[int, "samples of policy:samples and :first", (1,)] = 16
     draws: Annotated[int, "random selections per episode", (1,)] = 100
     time_limit: Annotated[
         float | None,
@@ -279,7 +278,6 @@ def _evaluations(
             options.k,
             methods,
             options.checkpoints,
-            num=options.num,
             random_draws=options.draws,
             seed=options.seed,
             time_limit=options.time_limit,

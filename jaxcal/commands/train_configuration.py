@@ -6,13 +6,15 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from inspect import signature
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
-from jaxcal.arguments import Parser, typed_line, values_of
+from jaxcal.arguments import Parser, outdated, typed_line, values_of
+from jaxcal.checks import nearest
 from jaxcal.commands.tables import holds_sets, read_pool
 from jaxcal.extras import needs
 from jaxcal.files import require_writable_folder
@@ -38,8 +40,9 @@ what to try first:
   {program} --episodes 20000 --out runs/brief   quicker, to try things
   {program} --num-selected 6 --out runs/six     another number of postures
   {program} --candidates mine.csv --out runs/mine   your own machine's postures
-  then --imitation 0.5 --initial-trust 4 --initial-actor 0.05, which helps most
-  when more than n + 1 postures are chosen. Other settings rarely need a change.
+  then --imitation 0.5 --with initial_trust=4 initial_actor=0.05, which helps most
+  when more than n + 1 postures are chosen. Other settings rarely need a change:
+  --help all.
 
 more examples:
   {program} --task knee            choose each measurement from the last results
@@ -56,8 +59,8 @@ Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
 All devices of all processes share each update: docs/scaling.md."""
 
 TASK_PARTS = (StreamsConfig, PolicyConfig)
-# Settings that the first screen of the help shows; --help all shows the others.
-FIRST = {"seed", "seeds", "learning_rate", "width", "episodes", "updates", "kind"} | {
+# Settings that have a flag; the others are given by --with.
+FLAGS = {"seed", "seeds", "learning_rate", "width", "episodes", "updates", "kind"} | {
     *("num_selected", "num_candidates", "num_inputs", "imitation")
 }
 _VALIDATED = 500  # sets that a training run is measured on
@@ -72,7 +75,11 @@ class TrainOptions:
 
     preset: Annotated[str | None, "for postures, see below [compact]", "NAME"] = None
     task: Annotated[str | None, "of sequential measurement, see below", "NAME"] = None
-    with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = ()
+    with_: Annotated[
+        tuple[str, ...],
+        "options of the task, and settings: --help all lists these",
+        "NAME=VALUE",
+    ] = ()
     out: Annotated[str | None, "run folder [runs/PRESET or runs/TASK]", "DIR"] = None
     resume: Annotated[bool, "resume from the run folder's checkpoint"] = False
     candidates: Annotated[
@@ -102,6 +109,8 @@ class TrainOptions:
 
 def flag_of(name: str) -> str:
     """The flag that sets a field."""
+    if name in _RARE:
+        return f"--with {name}"
     return "--" + _NAMES.get(name, name).rstrip("_").replace("_", "-")
 
 
@@ -113,21 +122,22 @@ def _settings(*parts: Any) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
 
 
 def _flags(title: str, settings: Iterable[tuple[dataclasses.Field[Any], Any]]) -> type:
-    """A dataclass of settings, None where one is not given, as ``Parser.of`` reads."""
+    """A dataclass of the settings that have a flag, None where one is not given, as
+    ``Parser.of`` reads."""
     shown: dict[Any, str] = {int: "N", float: "X", str: "NAME", bool: ""}
     kinds = {kind.__name__: kind for kind in shown}
     fields = []
     for field, value in settings:
+        if _NAMES.get(field.name, field.name) not in FLAGS:
+            continue
         single = kinds[str(field.type)]
         kind: Any = single | None
         said = Annotated[kind, f"{field.metadata['help']} [{value}]", shown[single]]
         default = dataclasses.field(default=None)
         fields.append((_NAMES.get(field.name, field.name), said, default))
     about = "in brackets: the value of compact"
-    rare = {name for name, *_ in fields} - FIRST
-    return dataclasses.make_dataclass(
-        "Settings", fields, namespace={"TITLE": title, "ABOUT": about, "RARE": rare}
-    )
+    names = {"TITLE": title, "ABOUT": about}
+    return dataclasses.make_dataclass("Settings", fields, namespace=names)
 
 
 _RUN = presets.load("compact")
@@ -136,6 +146,11 @@ _TASKS = _settings(PPO, PolicyConfig)
 _ONE = [field for name, field in _POSTURES.items() if name not in _TASKS]
 _OTHER = [field for name, field in _TASKS.items() if name not in _POSTURES]
 _BOTH = [field for name, field in _POSTURES.items() if name in _TASKS]
+_RARE = {
+    name: setting
+    for name, setting in (_TASKS | _POSTURES).items()
+    if _NAMES.get(name, name) not in FLAGS
+}
 Shared = _flags("for postures and tasks", _BOTH)
 OfPostures = _flags("for postures, in presets of one task", _ONE)
 OfTasks = _flags("of tasks", _OTHER)
@@ -171,6 +186,7 @@ def read(prog: str, argv: Sequence[str]) -> TrainOptions:
             presets=_abouts(presets),
             tasks=_abouts(registry),
         )
+        more += _of_with() if argv[-1] == "all" else ""
     parser = Parser(
         prog=prog,
         usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
@@ -184,15 +200,80 @@ def read(prog: str, argv: Sequence[str]) -> TrainOptions:
         ),
         epilog=more,
     ).of(asked)
-    return asked(**values_of(parser.parse_args(argv)))
+    words, settings = _of_flags(prog, argv)
+    options = asked(**values_of(parser.parse_args(words)))
+    options.with_ = (*options.with_, *settings)
+    return options
 
 
-def given_flags(arguments: TrainOptions, task: bool) -> dict[str, Any]:
-    """The fields of a configuration that were given: name to value; a flag that the
-    task, or the preset, does not read is refused."""
-    flags, read = arguments.values, _TASKS if task else _POSTURES
-    others = ("preset", "candidates", "no_validation") if task else ("with_",)
-    unread = {*flags} - {*read} | {name for name in others if getattr(arguments, name)}
+def _of_flags(prog: str, argv: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
+    """The words without the flags of 0.2 that are settings of ``--with`` now, and
+    these."""
+    words: list[str] = []
+    settings: list[str] = []
+    rest = iter(argv)
+    for word in rest:
+        flag, equals, value = word.partition("=")
+        name = flag.removeprefix("--").replace("-", "_")
+        yes = name in _RARE
+        name = name if yes else name.removeprefix("no_")
+        switch = name in _RARE and _RARE[name][0].type == "bool"
+        if not flag.startswith("--") or name not in _RARE or not (yes or switch):
+            words.append(word)
+            continue
+        value = str(yes).lower() if switch else value if equals else next(rest, "")
+        settings.append(f"{name}={value}")
+        outdated(prog, flag, f"--with {settings[-1]}")
+    return words, tuple(settings)
+
+
+def _of_with() -> str:
+    """The settings of ``--with`` in lines."""
+    lines = ["", "", "settings, --with NAME=VALUE, in brackets the value of compact:"]
+    for name, (field, value) in _RARE.items():
+        said = f"  {name:24} {field.metadata['help']} [{value}]"
+        lines += textwrap.wrap(said, 86, subsequent_indent=" " * 27)
+    return "\n".join(lines)
+
+
+def _value_of(name: str, text: str) -> Any:
+    """The value of a setting of ``--with``."""
+    kind = str(_RARE[name][0].type)
+    if kind == "bool":
+        if text.lower() not in ("true", "false"):
+            raise ValueError(f"--with {name} must be true or false, got {text!r}")
+        return text.lower() == "true"
+    try:
+        return {"int": int, "float": float, "str": str}[kind](text)
+    except ValueError:
+        what = "a whole number" if kind == "int" else "a number"
+        raise ValueError(f"--with {name} must be {what}, got {text!r}") from None
+
+
+def given_settings(
+    arguments: TrainOptions, options: Collection[str] | None
+) -> tuple[dict[str, Any], list[str]]:
+    """The fields of a configuration that were given: name to value; one that the task,
+    or the preset, does not read is refused. And what else ``--with`` names, of a task
+    with these ``options``, None for postures."""
+    task, values, others = options is not None, dict(arguments.values), []
+    for text in arguments.with_:
+        name, equals, value = text.partition("=")
+        name = name.replace("-", "_")
+        if equals and name in _RARE and name not in (options or ()):
+            values[name] = _value_of(name, value)
+        elif task:
+            others.append(text)
+        else:
+            like = nearest(name, _POSTURES)
+            more = f"; did you mean {flag_of(like)}?" if like else ""
+            raise ValueError(
+                "--with must be NAME=VALUE with a NAME that --help all lists, "
+                f"got {text!r}{more}"
+            )
+    flags, read = values, _TASKS if task else _POSTURES
+    refused = ("preset", "candidates", "no_validation") if task else ()
+    unread = {*flags} - {*read} | {name for name in refused if getattr(arguments, name)}
     if task and arguments.trainer != "jaxcal":
         unread.add("trainer")
     if unread:
@@ -200,7 +281,7 @@ def given_flags(arguments: TrainOptions, task: bool) -> dict[str, Any]:
         it = "it" if len(unread) == 1 else "them"
         names = ", ".join(sorted(map(flag_of, unread)))
         raise ValueError(f"{who} does not use {names}: leave {it} out")
-    return flags
+    return flags, others
 
 
 def _abouts(known: Any) -> str:
@@ -217,7 +298,7 @@ def _abouts(known: Any) -> str:
 
 def of_postures(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
     """Configuration of postures: from the flags, or from the run to go on with."""
-    flags = given_flags(arguments, task=False)
+    flags, _ = given_settings(arguments, None)
     path = arguments.candidates
     candidates = candidates_of(path) if path else None
     config = presets.load(arguments.preset_name)
@@ -225,7 +306,7 @@ def of_postures(arguments: TrainOptions, out: pathlib.Path) -> TrainConfig:
         config = _for_brax(config, arguments, flags)
     if arguments.resume:
         config = _configuration_of(out, candidates)
-        return _prolonged(config, arguments, flags, out)
+        return _prolonged(config, flags, out)
     _refuse_to_overwrite(out)
     if candidates is None:
         config = presets.with_values(config, flags)
@@ -290,7 +371,7 @@ def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
 
     assert arguments.task is not None  # it is what this function is for
     entry = registry.load(arguments.task)
-    flags = given_flags(arguments, task=True)
+    flags, others = given_settings(arguments, signature(entry.make).parameters)
     if arguments.resume:
         config = PolicyConfig.from_meta(checkpoint.read_meta(out, training.SCHEMA)[1])
         held, given_task = map(pathlib.Path, (config.task, arguments.task))
@@ -298,9 +379,9 @@ def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
         if held != given_task and not moved:
             raise ValueError(f"--task must be {config.task}, the task of {out}")
         config = dataclasses.replace(config, task=arguments.task)
-        return _prolonged(config, arguments, flags, out)
+        return _prolonged(config, flags | dict.fromkeys(others), out)
     _refuse_to_overwrite(out)
-    options = registry.options_from(entry, arguments.with_)
+    options = registry.options_from(entry, others)
     ppo, policy = (
         {f.name: flags[f.name] for f in settings_of(part) if f.name in flags}
         for part in TASK_PARTS
@@ -315,13 +396,10 @@ def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
     return dataclasses.replace(config, ppo=changed)
 
 
-def _prolonged(
-    config: Any, arguments: TrainOptions, flags: Mapping[str, Any], out: pathlib.Path
-) -> Any:
+def _prolonged(config: Any, flags: Mapping[str, Any], out: pathlib.Path) -> Any:
     """A run to go on with, where asked to a larger budget; what it imitates stays what
     it was. Other flags are refused beside ``--resume``."""
-    given = {*flags, *(["with"] if arguments.with_ else [])}
-    if unread := given - {"num_episodes", "num_updates"}:
+    if unread := {*flags} - {"num_episodes", "num_updates"}:
         raise ValueError(
             f"--resume takes its configuration from {out}; leave out "
             + ", ".join(sorted(map(flag_of, unread)))

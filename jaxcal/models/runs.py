@@ -238,6 +238,9 @@ def _result(future: Any) -> Answer | None:
     return answer
 
 
+_PLAIN = {list, tuple, np.ndarray}  # of numbers, as they are taken together
+
+
 def _answer(
     f: Callable[..., Any],
     batch: bool,
@@ -254,20 +257,28 @@ def _answer(
             result = None
         if result is not None:
             return _readings(result, len(commands)), {}
-    rows: list[Array] = []
+    results: list[Any] = []
     why: dict[int, str] = {}
+    given = (commands[:, None] if batch else commands).copy()  # f may write into it
     with np.errstate(all="ignore"):
-        for i, command in enumerate(commands):
-            argument = command[None] if batch else command
+        for i, command in enumerate(given):
             try:
-                result = f(argument.copy(), parameters.copy())
+                results.append(f(command, parameters.copy()))
             except Exception as error:
                 kind = "" if isinstance(error, _RunError) else type(error).__name__
                 why[i] = f"{kind}: {error}".removeprefix(": ").splitlines()[0]
-                continue
-            rows.append(_readings(result, 1 if batch else 0)[0])
-            if len(rows[-1]) != len(rows[0]):
-                raise ValueError(_of_shape(len(rows[0]), rows[-1], command))
+    if {*map(type, results)} <= _PLAIN:
+        try:  # at once
+            values = np.array(results, dtype=np.float64)
+        except (TypeError, ValueError):
+            values = np.zeros(0)
+        if values.ndim == 2 and values.size and not batch:
+            return values, why
+    rows = [_readings(result, 1 if batch else 0)[0] for result in results]
+    asked = (i for i in range(len(commands)) if i not in why)
+    for row, i in zip(rows, asked, strict=True):
+        if len(row) != len(rows[0]):
+            raise ValueError(_of_shape(len(rows[0]), row, commands[i]))
     return np.array(rows), why
 
 

@@ -126,7 +126,7 @@ def test_brax_is_rewarded_with_what_an_option_tells(task):
 
 @pytest.mark.slow
 def test_ppo_is_rewarded_with_what_an_option_tells(path, tmp_path):
-    sizes = ["--num-minibatches", "2", "--num-epochs", "1", "--width", "8"]
+    sizes = ["--with", "num_minibatches=2", "num_epochs=1", "--width", "8"]
     flags = ["--task", str(path), *sizes, "--out", str(tmp_path), "--updates", "1"]
     assert train_command.main(flags, "train.py") == 0
     (row,) = csv.DictReader((tmp_path / "metrics.csv").open())

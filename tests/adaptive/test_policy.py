@@ -203,7 +203,7 @@ def test_tasks_that_are_not_there_are_refused(tmp_path):
 def test_commands_train_resume_and_compare(tmp_path, capsys):
     small = ["--with", "cells=4", "sigma=0.05", "seconds=(5.0, 9.0)"]
     out = str(tmp_path / "run")
-    flags = ["--num-minibatches", "2", "--num-epochs", "1", "--width", "8"]
+    flags = ["--with", "num_minibatches=2", "num_epochs=1", "--width", "8"]
     start = ["--task", "knee", "--out", out]
     assert (
         train_command.main([*start, *small, *flags, "--updates", "1"], "train.py") == 0

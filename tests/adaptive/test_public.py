@@ -188,7 +188,7 @@ def test_commands_run_a_task_of_particles(tmp_path, capsys):
     )
     assert "methods must be of random, gain" in capsys.readouterr().err
     out = str(tmp_path / "run")
-    sizes = ["--num-minibatches", "2", "--num-epochs", "1", "--width", "8"]
+    sizes = ["--with", "num_minibatches=2", "num_epochs=1", "--width", "8"]
     start = ["--task", LOCATION, *small, *sizes, "--updates", "1", "--out", out]
     assert train_command.main(start, "train.py") == 0
     policy = [*arguments, "--checkpoint", out, "--methods", "gain,policy"]

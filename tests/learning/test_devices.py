@@ -175,8 +175,8 @@ def test_the_command_names_what_does_not_divide(tmp_path: pathlib.Path) -> None:
     done = subprocess.run(
         [
             *(sys.executable, str(ROOT / "train.py"), "--out", str(tmp_path / "run")),
-            *("--episodes-per-update", "96", "--episodes-per-set", "4"),
-            *("--num-minibatches", "2", "--episodes", "96"),
+            *("--with", "episodes_per_update=96", "episodes_per_set=4"),
+            *("num_minibatches=2", "--episodes", "96"),
         ],
         capture_output=True,
         text=True,

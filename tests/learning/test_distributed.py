@@ -24,13 +24,13 @@ ROOT = pathlib.Path(__file__).parents[2]
 QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 QUICK *= jaxlib.__version__.startswith("0.10.")
 TINY = (
-    "--episodes-per-update=64 --episodes-per-set=4 --num-minibatches=2 --width=8 "
-    "--encoder-rounds=1 --num-candidates=6 --num-selected=3 --num-inputs=1 "
-    "--num-outputs=1 --seed=3"
+    "--with episodes_per_update=64 episodes_per_set=4 num_minibatches=2 "
+    "encoder_rounds=1 num_outputs=1 --width=8 --num-candidates=6 --num-selected=3 "
+    "--num-inputs=1 --seed=3"
 ).split()
 # At the preset's learning rate so small a run is chaotic: a difference in the last
 # place grows some fivefold an update, and in the end another posture is drawn.
-CALM = "--learning-rate=2e-5 --final-learning-rate=2e-5".split()
+CALM = "--learning-rate=2e-5 --with final_learning_rate=2e-5".split()
 
 
 def free_port() -> int:

@@ -534,11 +534,11 @@ def test_learning_finds_the_papers_network_without_importing_the_paper():
 
 # The update that these flags compile is CONFIG's.
 SHORT = (
-    "--episodes=384 --episodes-per-update=64 --episodes-per-set=4 --num-minibatches=2 "
-    "--warmup-updates=1 --width=8 --encoder-rounds=0 --no-close-up "
-    "--num-candidates=8 --seed=3"
+    "--with episodes_per_update=64 episodes_per_set=4 num_minibatches=2 "
+    "warmup_updates=1 encoder_rounds=0 close_up=false "
+    "--episodes=384 --width=8 --num-candidates=8 --seed=3"
 ).split()
-SMALL = [*SHORT, "--num-inputs=2", "--num-outputs=2", "--num-selected=3"]
+SMALL = [*SHORT, "--num-inputs=2", "--with=num_outputs=2", "--num-selected=3"]
 
 
 def train(*arguments):
@@ -573,6 +573,35 @@ def test_train_command_trains_saves_and_refuses_to_overwrite(tmp_path, capsys):
     assert train("--out", out, "--resume", "--no-validation") == 0
 
 
+def test_flags_of_0_2_that_are_settings_now_still_work(capsys):
+    from jaxcal.commands import train_configuration as configuration
+
+    words = ["--lookahead=2", "--no-close-up", "--mirrored", "--num-epochs", "3"]
+    options = configuration.read("train.py", ["--with", "gae_lambda=0.9", *words])
+    flags, others = configuration.given_settings(options, None)
+    assert others == []
+    assert flags == {
+        "gae_lambda": 0.9, "lookahead": 2, "close_up": False, "mirrored": True,
+        "num_epochs": 3,
+    }  # fmt: skip
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == (
+        "train.py: --lookahead is --with lookahead=2 since jaxcal 0.3; the old name "
+        "goes with 0.4"
+    )
+    assert len(lines) == 4
+
+
+def test_an_option_of_a_task_goes_before_a_setting():
+    from jaxcal.commands import train_configuration as configuration
+
+    words = ["--task", "knee", "--with", "clip_range=0.1", "num_epochs=3", "sigma=1"]
+    options = configuration.read("train.py", words)
+    flags, others = configuration.given_settings(options, {"num_epochs", "sigma"})
+    assert flags == {"clip_range": 0.1}
+    assert others == ["num_epochs=3", "sigma=1"]
+
+
 BRAX = ["--trainer", "brax"]
 
 
@@ -585,7 +614,16 @@ BRAX = ["--trainer", "brax"]
         (["--resume"], "does not exist"),
         (["--out", "/proc/nowhere/run"], "cannot write in /proc"),
         (["--kind", "big"], "must be one of compact, observation, paper, got 'big'"),
-        ([*BRAX, "--num-epochs", "3"], "does not use --num-epochs: leave it out"),
+        ([*BRAX, "--with", "num_epochs=3"], "does not use --with num_epochs: leave it"),
+        (
+            ["--with", "num_epoch=3"],
+            "did you mean --with num_epochs",
+        ),
+        (["--with", "episode=3"], "got 'episode=3'; did you mean --episodes?"),
+        (["--with", "lookahead"], "must be NAME=VALUE with a NAME"),
+        (["--with", "lookahead=a"], "--with lookahead must be a whole number, got 'a'"),
+        (["--with", "close_up=2"], "--with close_up must be true or false, got '2'"),
+        (["--task", "knee", "--with", "mirrored=true"], "not use --with mirrored"),
         ([*BRAX, "--devices", "2", "--kind=paper"], "not use --devices, --kind"),
         ([*BRAX, "--preset", "general"], "trains on one task, preset general has 12"),
         ([*BRAX, "--resume", "--seeds=2"], "does not use --resume, --seeds"),
@@ -624,7 +662,7 @@ def test_help_says_what_every_number_is(capsys):
     parts = map(presets.settings_of, presets.PARTS.values())
     names = {field.name for fields in parts for field in fields}
     for name in names - {"num_episodes", "num_seeds"}:
-        assert f"--{name.replace('_', '-')}" in text
+        assert f"--{name.replace('_', '-')} " in text or f"\n  {name} " in text
     assert "what to try first" in text
     assert "passes over the decisions of an update [2]" in " ".join(text.split())
     for name in presets.names():

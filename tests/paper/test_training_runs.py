@@ -55,7 +55,7 @@ def test_a_run_of_train_is_kept(
 ) -> None:
     run, kept = tmp_path / "seed_3", tmp_path / "kept" / "seed_3"
     given = ["--seed", "3", "--episodes", "4096", "--out", str(run)]
-    assert train([*given, "--no-close-up"]) == 0  # as the kept runs are made
+    assert train([*given, "--with", "close_up=false"]) == 0  # as the kept runs are made
     assert main([str(run), "--out", str(kept.parent)]) == 0
     assert "4,096 episodes" in capsys.readouterr().out
     summary = json.loads((kept / "summary.json").read_text())
