@@ -122,7 +122,7 @@ def candidates_of(
     mean, std, draw = _drawn(model, prior)
     at_mean = predict(model, commands, mean)
     white = _whitening(model, noise, commands, mean, at_mean.shape)
-    linear = model.multiplicity > 0
+    linear = model.fitting.multiplicity > 0
     shape = (*at_mean.shape, len(mean))
     slope = derivative(model, commands, mean) if linear else np.zeros((*shape[:2], 0))
     costs = one_or_each("cost", numbers("cost", seconds), len(commands))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +12,7 @@ from jaxcal.arms.arm import Arm
 from jaxcal.arms.sensors.sensor import facts_of
 from jaxcal.checks import Array
 from jaxcal.late import late
-from jaxcal.models.model import ErrorGroups, Fitting, as_parameters
+from jaxcal.models.model import ErrorGroups, Fitting, Model, as_parameters
 
 
 class ArmFitting(Fitting):
@@ -29,6 +30,11 @@ class ArmFitting(Fitting):
     error_groups = late("jaxcal.arms.effects:error_groups", of="model")
     unexplained = late("jaxcal.arms.effects:unexplained", of="model")
     verdict = late("jaxcal.arms.verdict:verdict", of="model")
+
+    def misfit_model(self) -> Model:
+        chain: Any = self.model
+        bent: Model = chain.with_misfit()
+        return bent
 
     @property
     def misfit_std(self) -> float:
@@ -131,6 +137,7 @@ class ChainsFitting(Fitting):
     """What is asked of several chains: of each, in its rows."""
 
     result_type = late("jaxcal.arms.written:ArmCalibration")
+    misfit_model = ArmFitting.misfit_model
     prepared = late("jaxcal.arms.plausible:prepared_chains", of="model")
     verdict = late("jaxcal.arms.verdict:verdict_of_chains", of="model")
 

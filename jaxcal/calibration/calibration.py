@@ -87,7 +87,7 @@ class Calibration(Fit):
             ]
             if self.prior_precision.any() or self.unidentified is not None:
                 cells["from data"] = [f"{share:.0%}" for share in shares]
-        units = self.model.units_for(self.command_unit, self.measured_unit)
+        units = self.model.fitting.units_for(self.command_unit, self.measured_unit)
         if any(units):
             cells["unit"] = list(units)
         table = [[name, *column] for name, column in cells.items()]

@@ -167,7 +167,8 @@ def check(
         if len(off.white) > 1 and others.p_value(rest) >= _ALARMS:
             slip = changes_of_slips[most] / slopes_of_slips[most]
             at = np.flatnonzero(slips)[most]
-            unit = calibration.model.units_for("", calibration.measured_unit)[at]
+            fitting = calibration.model.fitting
+            unit = fitting.units_for("", calibration.measured_unit)[at]
             slipped = f"{names[at]} by {slip:.2g} {unit}"
     says, mispaired = "holds", None
     if p_value < _ALARMS:

@@ -100,7 +100,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
             f"model must have the parameters of the file, {names}, got {model.names}"
         )
     size = len(values["estimate"])
-    if size not in (len(names), len(model.with_misfit().names)):
+    if size not in (len(names), len(model.fitting.misfit_model().names)):
         raise ValueError(f'"estimate" must have shape ({len(names)},)')
     if (values["noise_std"] is None) != (values["joint_covariance"] is None):
         raise ValueError('"noise_std" and "joint_covariance" contradict each other')

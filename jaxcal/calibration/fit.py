@@ -242,7 +242,7 @@ class Fit:
     def whole(self) -> Model:
         """The model with the harmonics that were found, if any: its last parameters."""
         more = len(self.estimate) > len(self.names)
-        return self.model.with_misfit() if more else self.model
+        return self.model.fitting.misfit_model() if more else self.model
 
     @property
     def undetermined(self) -> Mask:
@@ -272,7 +272,7 @@ def to_parameters(fit: Fit) -> Array:
     """(p, p) from the coordinates of ``joint_covariance`` to ``parameters``."""
     if fit.centre is None:
         return np.eye(len(fit.names))
-    return np.asarray(fit.model.centred(-fit.centre))
+    return np.asarray(fit.model.fitting.centred(-fit.centre))
 
 
 def outputs_at(fit: Fit, commands: ArrayLike) -> Array:
@@ -351,7 +351,7 @@ def unseen_directions(fit: Fit) -> Array:
     null = np.zeros((0, len(fit.estimate))) if null is None else null
     if fit.centre is None:
         return null
-    return null @ np.asarray(fit.model.centred(fit.centre)).T
+    return null @ np.asarray(fit.model.fitting.centred(fit.centre)).T
 
 
 def as_points(fit: Fit, name: str, values: ArrayLike, width: int) -> Array:

@@ -86,7 +86,7 @@ def fit_model(
     if not exact and model.fitting.error_groups() is not None:
         noise, exact = with_play(model, noise, commands, spread), True
         spread = np.zeros_like(spread)
-    with_misfit = model.with_misfit() if prior is None and exact else model
+    with_misfit = model.fitting.misfit_model() if prior is None and exact else model
     fits_misfit = with_misfit is not model and model.fitting.fits_misfit
     fitted = with_misfit if fits_misfit else model
     scaled = prior is not None or exact  # as far as the prior wants it
@@ -229,7 +229,7 @@ def _centre(
     where that changes more than these, or commands say little (``excited``: refused).
     """
     centre = weights @ commands / weights.sum()
-    to_centred = model.centred(centre)
+    to_centred = model.fitting.centred(centre)
     if to_centred is None:
         return None, None
     if len(commands) <= len(centre) or null_directions(
@@ -294,7 +294,7 @@ def _fields(
     noise_std, noise_dof = _noise_level(solution)
     estimate, mean = solution.parameters, problem.mean
     if centre is not None:
-        back = np.asarray(problem.model.centred(-centre))
+        back = np.asarray(problem.model.fitting.centred(-centre))
         estimate, mean = back @ estimate, back @ mean
         null = None if null is None else null @ back.T
     estimated = None

@@ -44,7 +44,7 @@ def are_shared(problem: FitProblem) -> bool:
     """Whether few measurements are of parameters that several readings share, and their
     noise is of unknown levels, and of nothing else."""
     model, many = problem.model, not 1 < len(problem.commands) < _FEW
-    if problem.noise_known or problem.command_std.any() or model.multiplicity:
+    if problem.noise_known or problem.command_std.any() or model.fitting.multiplicity:
         return False
     if model.default_noise() is not None or many or len(problem.levels) < 2:
         return False

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import Array, axis_letter, axis_names, numbers, whole_number
 from jaxcal.information.regression import regressors
 from jaxcal.models.model import (
+    Fitting,
     Model,
     Theta,
     as_commands,
@@ -24,6 +25,30 @@ from jaxcal.models.model import (
 
 if TYPE_CHECKING:
     from jaxcal.models.formula import Levels
+
+
+class AffineFitting(Fitting):
+    """What is asked of ``y = A u + b``."""
+
+    @property
+    def multiplicity(self) -> int:
+        """How often log det of the blocks counts: once per output."""
+        return self.model.num_outputs
+
+    def centred(self, centre: Array) -> Array:
+        """(p, p): the outputs at the centre stand for b."""
+        m, n = self.model.num_outputs, self.model.num_inputs
+        to_centred = np.eye(m * (n + 1))
+        for i in range(m):
+            to_centred[m * n + i, i * n : (i + 1) * n] = centre
+        return to_centred
+
+    def units_for(self, command_unit: str, measured_unit: str) -> tuple[str, ...]:
+        slope = measured_unit
+        if command_unit:
+            slope = f"{measured_unit or '1'}/{command_unit}"
+        m = self.model.num_outputs
+        return (slope,) * (m * self.model.num_inputs) + (measured_unit,) * m
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,9 +69,8 @@ class Affine(Model):
         whole_number("num_outputs", self.num_outputs, 1)
 
     @property
-    def multiplicity(self) -> int:
-        """How often log det of the blocks counts: once per output."""
-        return self.num_outputs
+    def fitting(self) -> AffineFitting:
+        return AffineFitting(self)
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
@@ -88,25 +112,10 @@ class Affine(Model):
         """(..., N, 1, n + 1) information blocks [u, 1] of commands (..., N, n)."""
         return regressors(commands)[..., None, :]
 
-    def centred(self, centre: Array) -> Array:
-        """(p, p): the outputs at the centre stand for b."""
-        m, n = self.num_outputs, self.num_inputs
-        to_centred = np.eye(m * (n + 1))
-        for i in range(m):
-            to_centred[m * n + i, i * n : (i + 1) * n] = centre
-        return to_centred
-
     def affine(self, parameters: Array) -> tuple[Array, Array]:
         """A (m, n) and b (m,)."""
         m, n = self.num_outputs, self.num_inputs
         return parameters[: m * n].reshape(m, n), parameters[m * n :]
-
-    def units_for(self, command_unit: str, measured_unit: str) -> tuple[str, ...]:
-        slope = measured_unit
-        if command_unit:
-            slope = f"{measured_unit or '1'}/{command_unit}"
-        m = self.num_outputs
-        return (slope,) * (m * self.num_inputs) + (measured_unit,) * m
 
     def meanings(self, inputs: Sequence[str], outputs: Sequence[str]) -> list[str]:
         return [
@@ -303,6 +312,19 @@ class Linear(Model):
         return np.stack(columns, axis=-1)
 
 
+class PolynomialFitting(Fitting):
+    """What is asked of a polynomial."""
+
+    def centred(self, centre: Array) -> Array:
+        """(p, p) by the binomial theorem: ``u^a = sum of binom(a, k) c^(a-k) v^k``."""
+        high, low = self.model._powers[None], self.model._powers[:, None]
+        powers = range(self.model.degree + 1)
+        choices = np.array([[math.comb(a, k) for k in powers] for a in powers])
+        factors = choices[high, low] * centre ** np.maximum(high - low, 0)
+        of_output: Array = np.prod(factors, axis=-1)  # 0 where a power is lower
+        return np.asarray(np.kron(np.eye(self.model.num_outputs), of_output))
+
+
 class Polynomial(Linear):
     """All monomials of total degree up to ``degree``: 1, x, y, x^2, x y, y^2, ...
 
@@ -335,14 +357,9 @@ class Polynomial(Linear):
         )
         self._analytic = True
 
-    def centred(self, centre: Array) -> Array:
-        """(p, p) by the binomial theorem: ``u^a = sum of binom(a, k) c^(a-k) v^k``."""
-        high, low = self._powers[None], self._powers[:, None]
-        powers = range(self.degree + 1)
-        choices = np.array([[math.comb(a, k) for k in powers] for a in powers])
-        factors = choices[high, low] * centre ** np.maximum(high - low, 0)
-        of_output: Array = np.prod(factors, axis=-1)  # 0 where a power is lower
-        return np.asarray(np.kron(np.eye(self.num_outputs), of_output))
+    @property
+    def fitting(self) -> PolynomialFitting:
+        return PolynomialFitting(self)
 
     def affine(self, parameters: Array) -> tuple[Array, Array] | None:
         """A (m, n) and b (m,) of degree 1."""

@@ -98,12 +98,27 @@ class Fitting:
     sensed: Any = slice(0, 0)  # columns of commands that a reading brings
     placed: Any = ()  # parameters of what stands around it
     slips: Any = ()  # parameters that change when something slips
-    misfit_std: Any = 0.0  # of a reading, what ``with_misfit`` leaves
-    fits_misfit: Any = False  # ``with_misfit`` is fitted without a prior
+    multiplicity: Any = 0  # m where all outputs share one regressor
+    misfit_std: Any = 0.0  # of a reading, what ``misfit_model`` leaves
+    fits_misfit: Any = False  # ``misfit_model`` is fitted without a prior
     result_type: Any = None  # the subclass of ``jaxcal.Calibration`` that it gives
 
     def __init__(self, model: Any) -> None:
         self.model = model
+
+    def units_for(self, command_unit: str, measured_unit: str) -> tuple[str, ...]:
+        """p units of the parameters, "" where not known."""
+        return tuple(getattr(self.model, "units", ("",) * len(self.model.names)))
+
+    def centred(self, centre: Array) -> Array | None:
+        """(p, p) with ``f(u; theta) = f(u - centre; centred(centre) @ theta)``, or
+        None."""
+        return None
+
+    def misfit_model(self) -> Model:
+        """The model with more parameters, which come last: what the others leave."""
+        model: Model = self.model
+        return model
 
     def accuracy_units(self, measured_unit: str) -> tuple[str, ...]:
         """Units in which ``identify`` may be asked for an accuracy; () of none."""
@@ -213,7 +228,6 @@ class Model(abc.ABC):
 
     inputs: Any = ()
     linear: ClassVar[Any] = False  # ``f(u; theta) = J(u) theta``, J exact
-    multiplicity: ClassVar[Any] = 0  # m where all outputs share one regressor
     periods: ClassVar[Any] = None  # (q,) of readings that wrap, as 360; inf: does not
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -243,10 +257,6 @@ class Model(abc.ABC):
     def title(self) -> str:
         """The model in the first line of a calibration's summary."""
         return f"of {self._kind}"
-
-    def units_for(self, command_unit: str, measured_unit: str) -> tuple[str, ...]:
-        """p units of the parameters, "" where not known."""
-        return tuple(getattr(self, "units", ("",) * len(self.names)))
 
     def quantities(self, measured_unit: str) -> tuple[Quantity, ...]:
         """What the readings are of, each with its unit: one where all share it."""
@@ -297,15 +307,6 @@ class Model(abc.ABC):
     def affine(self, parameters: Array) -> tuple[Array, Array] | None:
         """A (m, n) and b (m,) of a model ``y = A u + b``; None for any other."""
         return None
-
-    def centred(self, centre: Array) -> Array | None:
-        """(p, p) with ``f(u; theta) = f(u - centre; centred(centre) @ theta)``, or
-        None."""
-        return None
-
-    def with_misfit(self) -> Model:
-        """This model with more parameters, which come last: what the others leave."""
-        return self
 
     @property
     def _kind(self) -> str:

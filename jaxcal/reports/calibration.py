@@ -289,7 +289,7 @@ def _by_row(head: Sequence[str], columns: Sequence[Array]) -> pages.Table:
 
 def _units(calibration: Fit) -> tuple[str, ...]:
     """(p,) of the parameters; empty where none is known."""
-    units = calibration.model.units_for(
+    units = calibration.model.fitting.units_for(
         calibration.command_unit, calibration.measured_unit
     )
     return units if any(units) else ()

@@ -227,7 +227,7 @@ def _table(
     commands, measured = commands[:most], measured[:most]
     counted = np.ones(len(commands), np.bool_) if counted is None else counted[:most]
     flat = bool((resolved.precisions == 0.0).all() and free.all())
-    shared = model.multiplicity > 0 and flat
+    shared = model.fitting.multiplicity > 0 and flat
     # A measurement that is written twice counts once.
     rows = np.hstack([commands, measured])
     first = np.unique(rows, axis=0, return_index=True)[1]

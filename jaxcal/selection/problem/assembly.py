@@ -52,7 +52,7 @@ def problem_of(
     """The problem of choosing k of the candidates by a criterion; see
     ``Design.select``."""
     joined = criterion if isinstance(criterion, ScenarioCriterion) else Mean(criterion)
-    default = "I" if offer.model and not offer.model.multiplicity else "D"
+    default = "I" if offer.model and not offer.model.fitting.multiplicity else "D"
     of_one = criterion_of(joined.criterion, region, default)
     scenarios, members = offer.scenarios, []
     for s, alone in enumerate(offer.by_scenario()):

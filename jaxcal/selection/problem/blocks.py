@@ -41,7 +41,7 @@ class Blocks:
             self._blocks = self._of(self._values)
             return
         assert offer.candidates is not None
-        self._values, self.times = offer.candidates, offer.model.multiplicity
+        self._values, self.times = offer.candidates, offer.model.fitting.multiplicity
         if offer.noise is not None and offer.noise.std is not None:
             self._std = float(offer.noise.std)
         self._blocks = self._of(self._values)
@@ -88,7 +88,7 @@ class _ModelBlocks(Blocks):
             spread = high - low
             far = (np.abs(middle) > _FAR * spread) & (spread > _MOVES * np.abs(middle))
             no_slopes = offer.noise is None or offer.noise.command_std is None
-            if far.any() and no_slopes and model.centred(middle) is not None:
+            if far.any() and no_slopes and model.fitting.centred(middle) is not None:
                 self._centre = np.where(far, middle, 0.0)
         self._noise = Noise() if offer.noise is None else offer.noise
         # Readings are off by what no parameter explains; a prediction is no reading.
@@ -185,13 +185,13 @@ def blocks_of(
         return Blocks(offer)
     if of_predictions and prior is None and model.fitting.misfit_std:
         misfit = model.fitting.misfit_std
-        return _ModelBlocks(offer, model.with_misfit(), misfit, of_predictions)
+        return _ModelBlocks(offer, model.fitting.misfit_model(), misfit, of_predictions)
     return _ModelBlocks(offer, model, 0.0, of_predictions or of_volume)
 
 
 def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> bool:
     """Is one block [u, 1] / std, counted once per output, all there is to know?"""
-    if not model.multiplicity:
+    if not model.fitting.multiplicity:
         return False
     if noise is not None:
         more = noise.covariance is not None or noise.command_std is not None

@@ -182,7 +182,7 @@ class CandidateSet:
         if self.model is None:
             self.model = Affine(array.shape[1], array.shape[1])
         model = self.model
-        if model.multiplicity and array.shape[1] != model.num_inputs:
+        if model.fitting.multiplicity and array.shape[1] != model.num_inputs:
             raise ValueError(
                 f"candidates must have shape (M, {model.num_inputs}) for this model, "
                 f"got {array.shape}"
@@ -195,7 +195,9 @@ class CandidateSet:
             self.measured = numbers("measured", self.measured)
         if self.scenarios is not None:
             self.scenarios = scenarios_of(self.scenarios, model, self.prior)
-        if model.multiplicity:  # which answers everywhere, by the commands themselves
+        if (
+            model.fitting.multiplicity
+        ):  # which answers everywhere, by the commands themselves
             rows: Any = self.measured
             rows = rows[:, None] if np.ndim(rows) == 2 else None
             flatten_rounding(spacing, array[:, None], self.available, rows, bias=True)
