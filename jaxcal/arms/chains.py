@@ -378,6 +378,7 @@ class Chains(Model):
         return np.asarray(self._gather(sizes))
 
     def with_misfit(self) -> Self:
+        """These chains, each with harmonics of its joints."""
         return self._bent
 
     @functools.cached_property
