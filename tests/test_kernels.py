@@ -247,7 +247,7 @@ def test_sanitizers_of_addresses_and_undefined_behaviour_report_nothing(tmp_path
     ]
     if not libraries or not all(pathlib.Path(path).is_absolute() for path in libraries):
         pytest.skip("GCC's sanitizers are not on this machine")
-    for folder in ("jaxcal", "tests", "benchmarks", "examples"):
+    for folder in ("jaxcal", "tests", "benchmarks", "examples", "checkpoints"):
         ignored = shutil.ignore_patterns("*.so", "__pycache__")
         shutil.copytree(ROOT / folder, tmp_path / folder, ignore=ignored)
     for name in ("pyproject.toml", "hatch_build.py", "README.md"):
