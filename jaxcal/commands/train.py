@@ -16,20 +16,21 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from jaxcal.arguments import refused, told, typed_line
 from jaxcal.checks import aligned
 from jaxcal.commands.train_configuration import (
     TrainOptions,
-    fixed_validation,
     of_postures,
     of_task,
     read,
-    teacher,
 )
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.learning.runtime import processes
 
 if TYPE_CHECKING:
+    from jaxcal.learning.training.postures import Validation
     from jaxcal.learning.training.presets import TrainConfig
     from jaxcal.learning.training.run import Report
 
@@ -39,6 +40,7 @@ Stop = Callable[[], bool]
 # Columns of progress: the reward of an update, and what is measured on fixed sets.
 _POSTURES = ("reward", "ratio to exact", "optima hit")
 _TASK = ("reward", "nats", "less the rule's")
+_VALIDATED = 500  # sets that a training run is measured on
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
@@ -124,8 +126,6 @@ def _run(arguments: TrainOptions, prog: str) -> int:
 
 
 def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) -> int:
-    import numpy as np
-
     from jaxcal.learning.runtime import devices
 
     trainer: Any
@@ -144,12 +144,12 @@ def _train(config: Any, arguments: TrainOptions, out: pathlib.Path, stop: Stop) 
         mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
         schema, columns = checkpoint.SCHEMA, _POSTURES
         introduction = _introduction(config, out, devices.describe(mesh))
-        more = {"teacher": teacher}
+        more = {"teacher": _teacher}
     if first:
         print(f"{introduction}\nconfiguration:")
         pprint.pp(config.as_meta(), width=88, compact=True)
         if not (arguments.task or arguments.no_validation):
-            more["validation"] = fixed_validation(config)
+            more["validation"] = _fixed_validation(config)
         reward, *measured = columns
         heads = f"{reward:>8} " + " ".join(f"{name:>16}" for name in measured)
         print(
@@ -272,3 +272,41 @@ def _compare_runs(
 
 def _clock(seconds: float) -> str:
     return str(datetime.timedelta(seconds=round(seconds)))
+
+
+def _fixed_validation(config: TrainConfig) -> Validation:
+    """500 uniform sets, never trained on, that depend on M and n of the first task
+    only, or draws of the user's candidates; and their optima."""
+    import jax
+
+    from jaxcal.learning.training.postures import Validation
+    from jaxcal.selection import exact_batch
+
+    task = config.tasks[0]
+    env = task.environment
+    if task.given is not None:
+        states = jax.vmap(task.reset)(
+            jax.random.split(jax.random.key(20261121), _VALIDATED)
+        )
+        sets = np.asarray(states.candidates, np.float64)
+        free = np.asarray(states.available)
+    else:
+        rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
+        sets = rng.uniform(size=(_VALIDATED, env.num_candidates, env.num_inputs))
+        free = np.ones(sets.shape[:2], bool)
+    best = exact_batch(sets, env.num_selected, available=free, num_outputs=1).log_det
+    return Validation(sets, np.asarray(best), env.num_outputs, free)
+
+
+def _teacher(
+    candidates: np.ndarray, available: np.ndarray, given: np.ndarray, k: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """A ``postures.Teacher``: the proven optimum where k is the number of regressors;
+    above it what Fedorov exchange finds, almost always that, in a time that does not
+    depend on the shape of the candidates."""
+    from jaxcal.selection import exact_batch, exchange_batch
+
+    required = given if given.shape[1] else None
+    solve = exact_batch if k == candidates.shape[2] + 1 else exchange_batch
+    solved = solve(candidates, k, available=available, required=required, num_outputs=1)
+    return solved.indices, solved.log_det

@@ -1,5 +1,5 @@
 """What ``train`` is given and begins with: flags, from the fields of configurations, a
-configuration, the user's own postures, sets to validate on, what to imitate."""
+configuration, the user's own postures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pathlib
 import textwrap
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from inspect import signature
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -23,9 +23,6 @@ from jaxcal.learning.environments.task import GivenCandidates
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.training import presets
 from jaxcal.learning.training.presets import TrainConfig
-
-if TYPE_CHECKING:
-    from jaxcal.learning.training.postures import Validation
 
 _EPILOG = """\
 presets for postures:
@@ -63,7 +60,6 @@ TASK_PARTS = (StreamsConfig, PolicyConfig)
 FLAGS = {"seed", "seeds", "learning_rate", "width", "episodes", "updates", "kind"} | {
     *("num_selected", "num_candidates", "num_inputs", "imitation")
 }
-_VALIDATED = 500  # sets that a training run is measured on
 _NAMES = {"num_episodes": "episodes", "num_updates": "updates", "num_seeds": "seeds"}
 
 
@@ -109,7 +105,7 @@ class TrainOptions:
 
 def flag_of(name: str) -> str:
     """The flag that sets a field."""
-    if name in _RARE:
+    if name in _BY_WITH:
         return f"--with {name}"
     return "--" + _NAMES.get(name, name).rstrip("_").replace("_", "-")
 
@@ -146,7 +142,7 @@ _TASKS = _settings(PPO, PolicyConfig)
 _ONE = [field for name, field in _POSTURES.items() if name not in _TASKS]
 _OTHER = [field for name, field in _TASKS.items() if name not in _POSTURES]
 _BOTH = [field for name, field in _POSTURES.items() if name in _TASKS]
-_RARE = {
+_BY_WITH = {
     name: setting
     for name, setting in (_TASKS | _POSTURES).items()
     if _NAMES.get(name, name) not in FLAGS
@@ -186,7 +182,7 @@ def read(prog: str, argv: Sequence[str]) -> TrainOptions:
             presets=_abouts(presets),
             tasks=_abouts(registry),
         )
-        more += _of_with() if argv[-1] == "all" else ""
+        more += _help_of_with() if argv[-1] == "all" else ""
     parser = Parser(
         prog=prog,
         usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
@@ -200,13 +196,13 @@ def read(prog: str, argv: Sequence[str]) -> TrainOptions:
         ),
         epilog=more,
     ).of(asked)
-    words, settings = _of_flags(prog, argv)
+    words, settings = _without_old(prog, argv)
     options = asked(**values_of(parser.parse_args(words)))
     options.with_ = (*options.with_, *settings)
     return options
 
 
-def _of_flags(prog: str, argv: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
+def _without_old(prog: str, argv: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
     """The words without the flags of 0.2 that are settings of ``--with`` now, and
     these."""
     words: list[str] = []
@@ -215,10 +211,10 @@ def _of_flags(prog: str, argv: Sequence[str]) -> tuple[list[str], tuple[str, ...
     for word in rest:
         flag, equals, value = word.partition("=")
         name = flag.removeprefix("--").replace("-", "_")
-        yes = name in _RARE
+        yes = name in _BY_WITH
         name = name if yes else name.removeprefix("no_")
-        switch = name in _RARE and _RARE[name][0].type == "bool"
-        if not flag.startswith("--") or name not in _RARE or not (yes or switch):
+        switch = name in _BY_WITH and _BY_WITH[name][0].type == "bool"
+        if not flag.startswith("--") or name not in _BY_WITH or not (yes or switch):
             words.append(word)
             continue
         value = str(yes).lower() if switch else value if equals else next(rest, "")
@@ -227,10 +223,10 @@ def _of_flags(prog: str, argv: Sequence[str]) -> tuple[list[str], tuple[str, ...
     return words, tuple(settings)
 
 
-def _of_with() -> str:
+def _help_of_with() -> str:
     """The settings of ``--with`` in lines."""
     lines = ["", "", "settings, --with NAME=VALUE, in brackets the value of compact:"]
-    for name, (field, value) in _RARE.items():
+    for name, (field, value) in _BY_WITH.items():
         said = f"  {name:24} {field.metadata['help']} [{value}]"
         lines += textwrap.wrap(said, 86, subsequent_indent=" " * 27)
     return "\n".join(lines)
@@ -238,7 +234,7 @@ def _of_with() -> str:
 
 def _value_of(name: str, text: str) -> Any:
     """The value of a setting of ``--with``."""
-    kind = str(_RARE[name][0].type)
+    kind = str(_BY_WITH[name][0].type)
     if kind == "bool":
         if text.lower() not in ("true", "false"):
             raise ValueError(f"--with {name} must be true or false, got {text!r}")
@@ -260,7 +256,7 @@ def given_settings(
     for text in arguments.with_:
         name, equals, value = text.partition("=")
         name = name.replace("-", "_")
-        if equals and name in _RARE and name not in (options or ()):
+        if equals and name in _BY_WITH and name not in (options or ()):
             values[name] = _value_of(name, value)
         elif task:
             others.append(text)
@@ -379,7 +375,8 @@ def of_task(arguments: TrainOptions, out: pathlib.Path) -> PolicyConfig:
         if held != given_task and not moved:
             raise ValueError(f"--task must be {config.task}, the task of {out}")
         config = dataclasses.replace(config, task=arguments.task)
-        return _prolonged(config, flags | dict.fromkeys(others), out)
+        named = {"with": others} if others else {}  # options of the task
+        return _prolonged(config, flags | named, out)
     _refuse_to_overwrite(out)
     options = registry.options_from(entry, others)
     ppo, policy = (
@@ -479,44 +476,3 @@ def trained_on(
     candidates.source(config.tasks[0].environment)  # refuses a pool that is too small
     task = dataclasses.replace(config.tasks[0], given=candidates)
     return dataclasses.replace(config, tasks=(task,))
-
-
-# -- of a run --------------------------------------------------------------------------
-
-
-def fixed_validation(config: TrainConfig) -> Validation:
-    """500 uniform sets, never trained on, that depend on M and n of the first task
-    only, or draws of the user's candidates; and their optima."""
-    import jax
-
-    from jaxcal.learning.training.postures import Validation
-    from jaxcal.selection import exact_batch
-
-    task = config.tasks[0]
-    env = task.environment
-    if task.given is not None:
-        states = jax.vmap(task.reset)(
-            jax.random.split(jax.random.key(20261121), _VALIDATED)
-        )
-        sets = np.asarray(states.candidates, np.float64)
-        free = np.asarray(states.available)
-    else:
-        rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
-        sets = rng.uniform(size=(_VALIDATED, env.num_candidates, env.num_inputs))
-        free = np.ones(sets.shape[:2], bool)
-    best = exact_batch(sets, env.num_selected, available=free, num_outputs=1).log_det
-    return Validation(sets, np.asarray(best), env.num_outputs, free)
-
-
-def teacher(
-    candidates: np.ndarray, available: np.ndarray, given: np.ndarray, k: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """A ``postures.Teacher``: the proven optimum where k is the number of regressors;
-    above it what Fedorov exchange finds, almost always that, in a time that does not
-    depend on the shape of the candidates."""
-    from jaxcal.selection import exact_batch, exchange_batch
-
-    required = given if given.shape[1] else None
-    solve = exact_batch if k == candidates.shape[2] + 1 else exchange_batch
-    solved = solve(candidates, k, available=available, required=required, num_outputs=1)
-    return solved.indices, solved.log_det

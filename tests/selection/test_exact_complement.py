@@ -86,6 +86,17 @@ def test_what_is_left_out_has_the_same_information(q):
         assert phi == pytest.approx(apart + other.shift, abs=1e-9)
 
 
+def test_what_is_nearly_singular_without_some_is_no_proof_by_what_is_left_out():
+    """Rounding of its minors would be larger than what is called proven."""
+    blocks = np.random.default_rng(0).standard_normal((8, 1, 12))
+    for scale, applies in ((1.0, True), (1e-3, True), (1e-9, False)):
+        problem = Design.from_blocks(blocks, prior=scale * np.eye(12)).problem(5, "D")
+        asked = problem.blocks, problem.prior, problem.criterion
+        other = complement(*asked, problem.lower, problem.upper, 5)
+        assert (other is not None) == applies
+        assert other is None or other.rounding < 1e-9
+
+
 def test_it_is_searched_where_its_bound_is_sharper(monkeypatch):
     """32 of 40 whose precision is the covariance of a field: 8 are left out."""
     rng = np.random.default_rng(0)

@@ -26,7 +26,8 @@ from jaxcal.selection.criteria import Criterion
 
 _WIDEST = 2.0  # times as many readings as parameters: beyond, (2) is never sharper
 _LARGEST = 400  # readings of all candidates
-_LEAST = 1e-7  # eigenvalue of what is regular without any candidate
+_LARGEST_ERROR = 5e-10  # of log det, by rounding: half of what is called proven
+_EPS = 2.0**-52
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Complement:
     most: Indices  # (M,) counts of everything
     left_out: int
     shift: float  # what phi is above phi of this choice
+    rounding: float  # what both may be off by
 
     def start(self, counts: Indices) -> Indices:
         """(N,) of a selection (M,)."""
@@ -62,7 +64,7 @@ def complement(
     k: int,
 ) -> Complement | None:
     """None where it does not apply: other criteria, replicates, many candidates, or
-    what is not regular without any of them."""
+    what is singular without them, or nearly: rounding is then larger than a proof's."""
     which = np.flatnonzero(upper > lower)
     (_, q, p), size = blocks.shape, len(which) * blocks.shape[1]
     some = 1 < size <= min(_WIDEST * p, _LARGEST)
@@ -73,15 +75,18 @@ def complement(
     triangle = np.linalg.cholesky(everything)
     turned = np.linalg.solve(triangle, blocks[which].reshape(size, p).T)
     values, vectors = np.linalg.eigh(np.eye(size) - turned.T @ turned)
-    least = float(values[0])
-    if not least > _LEAST:
+    unit, missing, least = np.eye(size - 1), int(upper.sum()) - k, float(values[0])
+    if not least > 0.0:
+        return None
+    # An error of the matrix counts by the inverse of a minor, trace at most this.
+    rounding = _EPS * float((1.0 / values[: missing * q]).sum())
+    if rounding > _LARGEST_ERROR:
         return None
     scale = np.sqrt((values[1:] - least).clip(0.0) / least)
     factors = np.ascontiguousarray(vectors[:, 1:] * scale)
-    unit, missing = np.eye(size - 1), int(upper.sum()) - k
     of_root = np.linalg.slogdet(np.array([everything, criterion.root]))[1]
     shift = of_root[0] - 2.0 * of_root[1] + missing * q * np.log(least)
     return Complement(
         factors.reshape(len(which), q, size - 1), unit, criterion.of_rows(unit), which,
-        upper, missing, float(shift),
+        upper, missing, float(shift), rounding,
     )  # fmt: skip

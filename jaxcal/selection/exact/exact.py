@@ -204,7 +204,8 @@ def _of_sharper(
             result = branch_and_bound(apart, *ends, begun, **options)
             return dataclasses.replace(
                 result, counts=other.counts(result.counts),
-                values=result.values + other.shift, bound=result.bound + other.shift,
+                values=result.values + other.shift,
+                bound=result.bound + other.shift + other.rounding,
             )  # fmt: skip
     return branch_and_bound(scenario, *bounds, start, **options)
 

@@ -195,9 +195,7 @@ class CandidateSet:
             self.measured = numbers("measured", self.measured)
         if self.scenarios is not None:
             self.scenarios = scenarios_of(self.scenarios, model, self.prior)
-        if (
-            model.fitting.multiplicity
-        ):  # which answers everywhere, by the commands themselves
+        if model.fitting.multiplicity:  # it answers everywhere, by commands alone
             rows: Any = self.measured
             rows = rows[:, None] if np.ndim(rows) == 2 else None
             flatten_rounding(spacing, array[:, None], self.available, rows, bias=True)

@@ -230,7 +230,7 @@ class Problem:
             white=self.white._replace(blocks=self.blocks[rows]),
             available=self.available[rows],
             required=np.searchsorted(rows, self.required),
-            max_replicates=times if isinstance(times, int) else times[rows],
+            max_replicates=times[rows] if isinstance(times, np.ndarray) else times,
             raw=self.raw[rows],
             readings=self.readings[rows],
             candidates=None if commands is None else commands[rows],
