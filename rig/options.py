@@ -6,10 +6,11 @@ import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rig.parts import SimulatedDevice, part
+from rig.parts import part
 
 if TYPE_CHECKING:
     from rig.config import RigConfig
+    from rig_workbench.simulator import Simulator
 
 
 def _axes(text: str) -> list[str]:
@@ -82,10 +83,10 @@ class DeviceOptions(Simulation):
 
     def simulator(
         self, config: RigConfig, options: dict[str, Any] | None = None
-    ) -> SimulatedDevice:
+    ) -> Simulator:
         """A simulated rig as these options, or those of a run, describe it."""
         options, simulator = options or self.simulation, part("simulator", "--simulate")
-        made: SimulatedDevice = simulator.simulated(config, options, self.fault or ())
+        made: Simulator = simulator.simulated(config, options, self.fault or ())
         return made
 
 
