@@ -1,4 +1,4 @@
-"""What another package adds to the rig, found by entry points; it is imported for types alone.
+"""What another package adds to the rig, found by entry points; only types import it.
 
 ``jaxcal_rig.commands`` are the commands, ``jaxcal_rig.parts`` what a session may need:
 ``model`` (of a device that is not affine), ``numbers`` (of a sensor), ``simulator``.

@@ -19,23 +19,20 @@ import numpy as np
 from rig.config.settings import BusSettings, ReadingsSettings
 from rig.drives.bus import Bus
 from rig.drives.modbus import decoded
+from rig.faults import Report, unheard
 from rig.readings.geometry import Array, Reading
-from rig.readings.source import JumpGate, ReadingError, Receiver
+from rig.readings.source import JumpGate, ReadingError, Source
+from rig.readings.stream import LineSplitter
 
 NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{0,17})?(?:[eE][+-]?[0-9]{1,2})?")
-MAX_LINE = 1024  # bytes
 RECONNECT_S = 0.2
 LOOK_S = 0.1  # between two looks at whether to end
 
 
-class Sensor(Receiver):
+class Sensor(Source):
     """Numbers as they come in, on one thread."""
 
-    def __init__(
-        self,
-        settings: ReadingsSettings,
-        report: Callable[..., object] = lambda event, **fields: None,
-    ) -> None:
+    def __init__(self, settings: ReadingsSettings, report: Report = unheard) -> None:
         super().__init__(settings, report)
         self.settings: ReadingsSettings = settings
         self.connections = 1  # numbers are the same whoever connects again
@@ -62,7 +59,7 @@ class Sensor(Receiver):
         with contextlib.ExitStack() as stack:
             read, write = self._connected(stack)
             request = self.settings.request.encode().decode("unicode_escape").encode()
-            tail, skip = b"", not request  # the first may be the end of another line
+            splitter = LineSplitter(torn=not request)
             while not self._closing.is_set():
                 if request:
                     write(request)
@@ -71,12 +68,8 @@ class Sensor(Receiver):
                     continue
                 if not data:
                     return
-                *whole, tail = re.split(rb"[\r\n]+", tail + data)
-                tail = tail if len(tail) <= MAX_LINE else b""
-                for line in whole:
-                    if not skip and line:
-                        self._take(line)
-                    skip = False
+                for line in splitter.feed(data):
+                    self._take(line)
 
     def _connected(
         self, stack: contextlib.ExitStack

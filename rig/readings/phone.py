@@ -17,7 +17,7 @@ import numpy as np
 from rig.config.settings import ImuSettings
 from rig.faults import Report, unheard
 from rig.readings.geometry import Array, Reading
-from rig.readings.source import BACKLOG, Receiver
+from rig.readings.source import BACKLOG, Source
 from rig.readings.stream import MAX_BODY, LineSplitter, StreamParser
 
 RECONNECT_S = 0.2
@@ -39,7 +39,7 @@ class Connection:
     splitter: LineSplitter = dataclasses.field(default_factory=LineSplitter)
 
 
-class Imu(Receiver):
+class Imu(Source):
     """The attitude of the phone, (3, 3) to its world: of one, whoever else connects.
 
     Messages are pushed over any connection of one address. Lines come over one: a phone

@@ -46,51 +46,83 @@ class JumpGate:
 
 
 class Source(abc.ABC):
-    """Readings, now and over the last seconds.
+    """Readings, now and over the last seconds, of what is called or calls at ``host``
+    and ``port`` of its settings.
 
-    A kind opens its port, receives on a thread of its own, and gives each accepted
-    reading to ``store``; see docs/rig/readings.md.
+    A kind receives on a thread, and gives each accepted reading to ``store``; see
+    docs/rig/readings.md.
     """
 
     whose = "the sensor"
     table = "readings"  # of rig.toml
     start = "switch it on"
     lost = "Check its power and cable"
-    settings: Any  # ImuSettings, ReadingsSettings
     sender = ""  # address that is heard, once a reading of it was used
     connections = 0  # a heading may be another one after a new connection
     world: Array = np.eye(3)  # by which attitudes are turned
 
-    def __init__(self, stale_s: float, report: Report = unheard) -> None:
+    def __init__(self, settings: Any, report: Report = unheard) -> None:
         """``report`` gets an event and its fields, on the receiving thread."""
-        self.stale_s = stale_s
+        self.settings, self.stale_s, self.port = (
+            settings,
+            settings.stale_s,
+            settings.port,
+        )
         self.report = report
         self.refused: list[str] = []  # addresses that were not let in
         self._lock = threading.Lock()
         self._ring: deque[Reading] = deque(maxlen=RING)
         self._counts: Counter[str] = Counter()
-        self._arrived, self._port = 0.0, 0
+        self._arrived = 0.0
         self._ended = ""  # why nothing is received any more
-
-    # Of a kind
+        self._closing = threading.Event()
+        self._listener: socket.socket | None = None  # where this computer is called
+        self._thread = threading.Thread(
+            target=self._receive, name=self.table, daemon=True
+        )
 
     @abc.abstractmethod
-    def open(self) -> Any:
-        """Begin to receive; ReadingError where the port cannot be opened."""
+    def receive(self) -> None:
+        """Take what comes, on the thread, until it is closing."""
 
-    @abc.abstractmethod
-    def close(self) -> None:
-        """Stop receiving and close the port."""
+    def _receive(self) -> None:
+        try:
+            self.receive()
+        except Exception as error:
+            self._ended = f"{type(error).__name__}: {error}"
 
     @property
-    @abc.abstractmethod
     def where(self) -> str:
         """Where it is heard, in words."""
+        return f"{self.settings.host}:{self.port}"
 
-    @property
-    def port(self) -> int:
-        """TCP or UDP port, where there is one."""
-        return self._port
+    def open(self) -> Any:
+        """Begin to receive; ReadingError where the port cannot be opened."""
+        place = (self.settings.host, self.settings.port)
+        try:
+            if self.settings.transport == "listen":
+                self._listener = socket.create_server(place, backlog=BACKLOG)
+            elif self.settings.transport == "udp":
+                self._listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                self._listener.bind(place)
+        except OSError as error:
+            raise ReadingError(
+                f"cannot open the port of {self.whose}, {self.where}: "
+                f"{error.strerror or error}. End the program that uses it, or change "
+                f"{self.table}.host and {self.table}.port"
+            ) from None
+        if self._listener is not None:
+            self.port = int(self._listener.getsockname()[1])
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Stop receiving and close the port."""
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+        if self._listener is not None:
+            self._listener.close()
 
     def turn(self, world: Array) -> None:
         """Turn all readings, those that were received too; of attitudes alone."""
@@ -105,8 +137,6 @@ class Source(abc.ABC):
             if reading.time > last - 1e-3:
                 self._ring.append(Reading(max(last, reading.time), reading.value))
         return bool(readings)
-
-    # Of all of them
 
     def __enter__(self) -> Any:
         return self.open()
@@ -132,14 +162,6 @@ class Source(abc.ABC):
                 f"{self.table}.stale_s = {limit:g} s). {hint}{self.dropped}"
             )
         return reading
-
-    def closed(self, error: OSError) -> ReadingError:
-        """Why its port cannot be opened, and what to do."""
-        return ReadingError(
-            f"cannot open the port of {self.whose}, {self.where}: "
-            f"{error.strerror or error}. End the program that uses it, or change "
-            f"{self.table}.host and {self.table}.port"
-        )
 
     def since(self, start: float) -> list[Reading]:
         """Readings measured at or after a monotonic time, oldest first."""
@@ -180,53 +202,3 @@ class Source(abc.ABC):
                         f"address, port and [{self.table}]"
                     ) from None
             time.sleep(0.01)
-
-
-class Receiver(Source):
-    """A source that is called or calls at ``host`` and ``port`` of its settings."""
-
-    def __init__(self, settings: Any, report: Report = unheard) -> None:
-        super().__init__(settings.stale_s, report)
-        self.settings = settings
-        self._port = settings.port
-        self._closing = threading.Event()
-        self._listener: socket.socket | None = None  # where this computer is called
-        self._thread = threading.Thread(
-            target=self._receive, name=self.table, daemon=True
-        )
-
-    def _receive(self) -> None:
-        try:
-            self.receive()
-        except Exception as error:
-            self._ended = f"{type(error).__name__}: {error}"
-
-    @abc.abstractmethod
-    def receive(self) -> None:
-        """Take what comes, on the thread, until it is closing."""
-
-    @property
-    def where(self) -> str:
-        return f"{self.settings.host}:{self.port}"
-
-    def open(self) -> Any:
-        place = (self.settings.host, self.settings.port)
-        try:
-            if self.settings.transport == "listen":
-                self._listener = socket.create_server(place, backlog=BACKLOG)
-            elif self.settings.transport == "udp":
-                self._listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-                self._listener.bind(place)
-        except OSError as error:
-            raise self.closed(error) from None
-        if self._listener is not None:
-            self._port = int(self._listener.getsockname()[1])
-        self._thread.start()
-        return self
-
-    def close(self) -> None:
-        self._closing.set()
-        if self._thread.is_alive():
-            self._thread.join(2.0)
-        if self._listener is not None:
-            self._listener.close()

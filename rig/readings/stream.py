@@ -41,9 +41,9 @@ class _Dropped(ValueError):
 class LineSplitter:
     """A byte stream to lines; CR, LF and ``#`` end one. Never holds over MAX_LINE."""
 
-    def __init__(self) -> None:
+    def __init__(self, torn: bool = True) -> None:
         self._tail = b""
-        self._skip = True  # the first line may be the end of one that began earlier
+        self._skip = torn  # the first line may be the end of one that began earlier
 
     def feed(self, data: bytes) -> list[bytes]:
         """Complete lines, without their ends; empty and over-long ones are left out."""
