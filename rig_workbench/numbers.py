@@ -7,11 +7,10 @@ jump. Everything else is counted and dropped.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import re
-import socket
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,15 +20,15 @@ from rig.drives.bus import Bus
 from rig.drives.modbus import decoded
 from rig.faults import Report, unheard
 from rig.readings.geometry import Array, Reading
-from rig.readings.source import JumpGate, ReadingError, Source
+from rig.readings.network import RECONNECT_S, Connection, Stream
+from rig.readings.source import JumpGate, ReadingError
 from rig.readings.stream import LineSplitter
 
 NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{0,17})?(?:[eE][+-]?[0-9]{1,2})?")
-RECONNECT_S = 0.2
-LOOK_S = 0.1  # between two looks at whether to end
+LOOK_S = 0.1  # for a reply to a request, or between two looks at whether to end
 
 
-class Sensor(Source):
+class Sensor(Stream):
     """Numbers as they come in, on one thread."""
 
     def __init__(self, settings: ReadingsSettings, report: Report = unheard) -> None:
@@ -37,6 +36,8 @@ class Sensor(Source):
         self.settings: ReadingsSettings = settings
         self.connections = 1  # numbers are the same whoever connects again
         self._gate = JumpGate(lambda a, b: np.abs(b - a).max(), settings.most_jump)
+        request = settings.request.encode()  # as it is sent
+        self._request = request.decode("unicode_escape").encode()
 
     @property
     def where(self) -> str:
@@ -45,77 +46,36 @@ class Sensor(Source):
     # On the thread
 
     def receive(self) -> None:
-        if self._listener is not None:
-            self._listener.settimeout(LOOK_S)
-        ways = {"udp": self._datagrams, "modbus": self._registers}
-        way = ways.get(self.settings.transport, self._lines)
+        ways = {"serial": self._serial, "modbus": self._registers}
+        if (way := ways.get(self.settings.transport)) is None:
+            return super().receive()
         while not self._closing.is_set():
             with contextlib.suppress(OSError, ReadingError):
                 way()
             self._closing.wait(RECONNECT_S)
 
-    def _lines(self) -> None:
-        """Lines of one connection, until it ends."""
-        with contextlib.ExitStack() as stack:
-            read, write = self._connected(stack)
-            request = self.settings.request.encode().decode("unicode_escape").encode()
-            splitter = LineSplitter(torn=not request)
+    async def hear(self, connection: Connection) -> bool:
+        if not self._request:
+            return await super().hear(connection)
+        connection.splitter.torn = False
+        connection.writer.write(self._request)
+        with contextlib.suppress(TimeoutError):  # it is asked again
+            async with asyncio.timeout(LOOK_S):
+                return await super().hear(connection)
+        return True
+
+    def _serial(self) -> None:
+        """Lines of a serial port, until it is gone."""
+        import serial  # type: ignore[import-untyped]  # no stubs
+
+        s, splitter = self.settings, LineSplitter(torn=not self._request)
+        with serial.Serial(
+            s.device, s.baudrate, s.bytesize, s.parity, s.stopbits, timeout=LOOK_S
+        ) as port:
             while not self._closing.is_set():
-                if request:
-                    write(request)
-                data = read()
-                if data is None:
-                    continue
-                if not data:
-                    return
-                for line in splitter.feed(data):
-                    self._take(line)
-
-    def _connected(
-        self, stack: contextlib.ExitStack
-    ) -> tuple[Callable[[], bytes | None], Callable[[bytes], object]]:
-        """How to read what came, None for nothing yet, b"" for the end; and write."""
-        s = self.settings
-        if s.transport == "serial":
-            import serial  # type: ignore[import-untyped]  # no stubs
-
-            port = serial.Serial(
-                s.device, s.baudrate, s.bytesize, s.parity, s.stopbits, timeout=LOOK_S
-            )
-            stack.enter_context(port)
-            return lambda: port.read(max(1, port.in_waiting)) or None, port.write
-        if self._listener is not None:
-            while True:
-                try:
-                    connection, (address, *_) = self._listener.accept()
-                    break
-                except TimeoutError:
-                    if self._closing.is_set():
-                        raise
-        else:
-            address = s.host
-            connection = socket.create_connection((address, s.port), 1.0)
-        stack.enter_context(connection)
-        connection.settimeout(LOOK_S)
-        if not self._hears(address):
-            raise ReadingError(address)
-
-        def read() -> bytes | None:
-            try:
-                return connection.recv(4096)
-            except TimeoutError:
-                return None
-
-        return read, connection.sendall
-
-    def _datagrams(self) -> None:
-        assert self._listener is not None
-        while not self._closing.is_set():
-            with contextlib.suppress(TimeoutError):
-                data, (address, *_) = self._listener.recvfrom(65536)
-                lines = re.split(rb"[\r\n]+", data) if self._hears(address) else ()
-                for line in filter(None, lines):
-                    self._take(line)
+                port.write(self._request)
+                data = port.read(max(1, port.in_waiting))
+                self.take_lines(splitter.feed(data), time.monotonic())
 
     def _registers(self) -> None:
         """Poll the registers."""
@@ -128,18 +88,13 @@ class Sensor(Source):
             while not self._closing.wait(s.period_s):
                 asked = time.monotonic()
                 values = [decoded(bus, p, p.unit, p.word_order, 1) for p in s.registers]
-                self._accept(np.array(values, dtype=np.float64), asked)
+                self._keep(np.array(values, dtype=np.float64), asked)
 
-    def _hears(self, address: str) -> bool:
-        """One sender is heard: the first."""
-        self.sender = self.sender or address
-        if address != self.sender:
-            self._counts["of another sender"] += 1
-        return address == self.sender
+    def take_lines(self, lines: list[bytes], now: float) -> bool:
+        return any([self._take(line, now) for line in lines])
 
-    def _take(self, line: bytes) -> None:
-        s = self.settings
-        now, text = time.monotonic(), line.decode("ascii", "replace")
+    def _take(self, line: bytes, now: float) -> bool:
+        s, text = self.settings, line.decode("ascii", "replace")
         fields = [field.strip() for field in text.split(s.separator)]
         columns = s.columns or range(len(s.names))
         if len(fields) <= max(columns):
@@ -147,9 +102,9 @@ class Sensor(Source):
         used = [fields[column] for column in columns]
         if not all(NUMBER.fullmatch(field) for field in used):
             return self._drop("not numbers")
-        self._accept(np.array(used, dtype=np.float64), now)
+        return self._keep(np.array(used, dtype=np.float64), now)
 
-    def _accept(self, values: Array, now: float) -> None:
+    def _keep(self, values: Array, now: float) -> bool:
         s = self.settings
         factors = s.factors or (1.0,) * len(s.names)
         values = values * factors
@@ -159,8 +114,9 @@ class Sensor(Source):
             return self._drop("an impossible jump")
         with self._lock:
             self._counts["accepted"] += 1
-            self.store([Reading(now, values)])
+            return self.store([Reading(now, values)])
 
-    def _drop(self, reason: str) -> None:
+    def _drop(self, reason: str) -> bool:
         with self._lock:
             self._counts[reason] += 1
+        return False

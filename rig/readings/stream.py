@@ -43,7 +43,7 @@ class LineSplitter:
 
     def __init__(self, torn: bool = True) -> None:
         self._tail = b""
-        self._skip = torn  # the first line may be the end of one that began earlier
+        self.torn = torn  # the first line may be the end of one that began earlier
 
     def feed(self, data: bytes) -> list[bytes]:
         """Complete lines, without their ends; empty and over-long ones are left out."""
@@ -51,12 +51,12 @@ class LineSplitter:
         self._tail = parts.pop()
         lines = []
         for part in parts:
-            whole = not self._skip or _is_header(part) or part[:1] + part[-1:] == b"{}"
-            self._skip = False
+            whole = not self.torn or _is_header(part) or part[:1] + part[-1:] == b"{}"
+            self.torn = False
             if part and whole and len(part) <= MAX_LINE:
                 lines.append(part)
         if len(self._tail) > MAX_LINE:
-            self._tail, self._skip = b"", True
+            self._tail, self.torn = b"", True
         return lines
 
 

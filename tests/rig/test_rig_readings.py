@@ -110,7 +110,7 @@ def test_one_sender_is_heard_and_a_silent_one_is_stale():
             first.sendto(b"90,2", at)
             first.sendto(b"2,2", at)
             read(source, [2, 2])
-        assert source.counts["of another sender"] == 1
+        assert source.refused == ["127.0.0.2"]
         assert source.counts["an impossible jump"] == 1
         source.stale_s = 0.01
         time.sleep(0.02)
@@ -130,3 +130,17 @@ def test_one_sender_is_heard_and_a_silent_one_is_stale():
 def test_wrong_readings_are_refused(old, new, told):
     with pytest.raises(ConfigError, match=told):
         parse_config(measured_text(AXES).replace(old, new, 1))
+
+
+def test_a_sensor_that_waits_for_a_request_is_asked_for_each_line():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        given = config("tcp", f"port = {port}", r'request = "?\\r"')
+        with make_source(given) as source:
+            connection, _ = server.accept()
+            with connection:
+                for value in (1.0, 2.0):
+                    while b"?\r" not in connection.recv(64):
+                        pass
+                    connection.sendall(b"%g,3\r\n" % value)
+                    read(source, [value, 3.0])
