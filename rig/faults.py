@@ -110,8 +110,14 @@ def ending(error: BaseException, folder: pathlib.Path) -> tuple[int, str, str]:
     return EXIT_FAULT, "fault", f"{type(error).__name__}: {error}"
 
 
-class Requests:
-    """What was asked of a session from outside: flags, looked at before every frame."""
+class Signals:
+    """What was asked of a session from outside, looked at before every frame. Ctrl-C
+    once: finish the posture and pause. Twice, or any other signal: stop now.
+
+    While armed, a signal only sets a flag, so that no frame and no line of the journal
+    is cut in two; else it ends a program that is not ending. Where the main thread,
+    which runs handlers, hangs, a second one sets the flag for the heartbeat.
+    """
 
     def __init__(self) -> None:
         self.armed = False
@@ -119,6 +125,8 @@ class Requests:
         self.pause = False
         self._stop: StopRequested | None = None
         self._asked = 0.0
+        self._previous: dict[int, Any] = {}
+        self._pipe = -1  # that wakes the listener
 
     def request_stop(self, reason: str, exit_code: int) -> None:
         """Ask for a stop; the first request is the one that is kept."""
@@ -140,20 +148,6 @@ class Requests:
         self.check_stop()
         if self.pause:
             raise PauseRequested("paused by Ctrl-C")
-
-
-class Signals(Requests):
-    """Ctrl-C once: finish the posture and pause. Twice, or any other signal: stop now.
-
-    While armed, a signal only sets a flag, so that no frame and no line of the journal
-    is cut in two; else it ends a program that is not ending. Where the main thread,
-    which runs handlers, hangs, a second one sets the flag for the heartbeat.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._previous: dict[int, Any] = {}
-        self._pipe = -1  # that wakes the listener
 
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():

@@ -62,11 +62,10 @@ def write_report(folder: pathlib.Path) -> None:
             timeout=REPORT_S,
             start_new_session=True,  # Ctrl-C is not for it
         )
-    except subprocess.CalledProcessError as error:
-        text = str(error.stderr).strip().rpartition("\n")[2] or error
+    except subprocess.SubprocessError as error:
+        told = str(getattr(error, "stderr", None) or "").strip()
+        text = told.rpartition("\n")[2] or error
         raise Fault(f"no {REPORT} was written: {text}") from None
-    except subprocess.TimeoutExpired as error:
-        raise Fault(f"no {REPORT} was written: {error}") from None
 
 
 def _command(name: str, folder: pathlib.Path) -> list[str]:

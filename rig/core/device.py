@@ -18,7 +18,7 @@ from rig.core.record_check import check_drives
 from rig.drives import Drive, Line
 from rig.drives.drive import Status
 from rig.drives.line import BusError
-from rig.faults import LimitError, MotionFault, PauseRequested, Requests
+from rig.faults import LimitError, MotionFault, PauseRequested, Signals
 from rig.journal.device import SIGN_CHECKED, DeviceRecord
 from rig.journal.run_folder import Record, RunFolder
 from rig.readings import make_source
@@ -83,7 +83,7 @@ class SessionRun(RunFolder):
     """The folder of a run, and what its session is opened with."""
 
     record: DeviceRecord  # of what was proved of the device
-    signals: Requests  # to pause or to stop, from outside
+    signals: Signals  # to pause or to stop, from outside
     reset_alarms: bool  # of drives that are in alarm
     # (m,) that is measured at (n,) commands, by its model as designed.
     predict: Callable[[Array], Array] | None

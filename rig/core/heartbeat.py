@@ -16,7 +16,7 @@ from rig.core import stop
 from rig.core.stop import UnitStop
 from rig.drives import Drive
 from rig.drives.line import BusError
-from rig.faults import EXIT_FAULT, Requests, StopRequested
+from rig.faults import EXIT_FAULT, Signals, StopRequested
 
 OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
 TICK_S = 0.05  # of the heartbeat
@@ -62,7 +62,7 @@ class Heartbeat(threading.Thread):
     """Stops the drives when the motion loop is silent, or does not answer a stop; keeps
     the line alive for drives that watch it while nothing moves."""
 
-    def __init__(self, stopper: Stopper, requests: Requests, config: RigConfig) -> None:
+    def __init__(self, stopper: Stopper, requests: Signals, config: RigConfig) -> None:
         super().__init__(name="heartbeat", daemon=True)
         self._requests = requests
         self._stopper = stopper
