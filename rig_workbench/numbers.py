@@ -20,7 +20,7 @@ from rig.drives.bus import Bus
 from rig.drives.modbus import decoded
 from rig.faults import Report, unheard
 from rig.readings.geometry import Array, Reading
-from rig.readings.network import RECONNECT_S, Connection, Stream
+from rig.readings.phone import RECONNECT_S, Connection, Stream
 from rig.readings.source import JumpGate, ReadingError
 from rig.readings.stream import LineSplitter
 

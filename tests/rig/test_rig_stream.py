@@ -12,7 +12,7 @@ import pytest
 from harness import changed, fast_config
 from scipy.spatial.transform import Rotation
 
-from rig.readings import network as receiver
+from rig.readings import phone as receiver
 from rig.readings.geometry import angle_between_deg, euler_to_matrix, matrix_to_euler
 from rig.readings.phone import Imu
 from rig.readings.source import ReadingError
