@@ -39,13 +39,16 @@ def kind_of(drive_map: DriveMap) -> type[Drive]:
     text = KINDS.get(drive_map.drive, drive_map.drive)
     try:
         drive_type: Any = named(text, drive_map.folder)
-        line_type = getattr(drive_type, "line_type", None)
-        for kind, base in ((drive_type, Drive), (line_type, Line)):
-            name = getattr(kind, "__name__", repr(kind))
-            if not isinstance(kind, type) or not issubclass(kind, base):
-                raise TypeError(f"{name} is no subclass of rig.drives.{base.__name__}")
+        if not isinstance(drive_type, type) or not issubclass(drive_type, Drive):
+            name = getattr(drive_type, "__name__", repr(drive_type))
+            raise TypeError(f"{name} is no subclass of rig.drives.Drive")
+        line_type: Any = getattr(drive_type, "line_type", None)
+        if not isinstance(line_type, type) or not issubclass(line_type, Line):
+            must = "line_type must be a subclass of rig.drives.Line"
+            raise TypeError(f"{drive_type.__name__}.{must}")
+        for kind in (drive_type, line_type):
             for method in sorted(kind.__abstractmethods__):
-                raise TypeError(f"{name} must define {method}")
+                raise TypeError(f"{kind.__name__} must define {method}")
     except Exception as error:  # whatever the import of foreign code raises
         raise Refused(
             f"the map {drive_map.name} names drive = {drive_map.drive!r}, which cannot "
