@@ -20,7 +20,7 @@ from rig.drives.bus import Bus
 from rig.drives.modbus import decoded
 from rig.faults import Report, unheard
 from rig.readings.geometry import Array, Reading
-from rig.readings.phone import RECONNECT_S, Connection, Stream
+from rig.readings.phone import PATIENCE_S, RECONNECT_S, Connection, Stream
 from rig.readings.source import JumpGate, ReadingError
 from rig.readings.stream import LineSplitter
 
@@ -44,6 +44,10 @@ class Sensor(Stream):
         return self.settings.device or super().where
 
     # On the thread
+
+    @property
+    def patience_s(self) -> float:
+        return max(PATIENCE_S, 2.0 * self.stale_s)  # a slow sensor says little
 
     def receive(self) -> None:
         ways = {"serial": self._serial, "modbus": self._registers}

@@ -23,7 +23,7 @@ from rig.readings.stream import MAX_BODY, LineSplitter, StreamParser
 
 RECONNECT_S = 0.2
 MOST_OPEN = 64  # connections at a time
-PATIENCE_S = 5.0  # of a connection for a line, or a whole message
+PATIENCE_S = 5.0  # with a connection that says nothing
 MAX_HEAD = 8192  # bytes of a message before its body
 LOOK_S = 0.05  # between two looks at whether to end
 
@@ -58,6 +58,11 @@ class Stream(Source):
         asyncio.run(self._run())
 
     # On the receiving thread
+
+    @property
+    def patience_s(self) -> float:
+        """With a connection, for a line or a whole message."""
+        return PATIENCE_S
 
     def begin(self) -> None:
         """Lines come over another connection from now on."""
@@ -140,7 +145,7 @@ class Stream(Source):
             stays = True
             try:
                 while stays:  # not wait_for, which may lose the cancelling of a task
-                    async with asyncio.timeout(PATIENCE_S):
+                    async with asyncio.timeout(self.patience_s):
                         stays = await self.hear(connection)
             finally:
                 connection.writer.close()
