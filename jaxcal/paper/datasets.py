@@ -11,10 +11,6 @@ Datasets 0, 4 and 5, simulated and recorded, are made in the repository:
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator
-from typing import Any
-
 import numpy as np
 
 from jaxcal.candidates import JointRanges
@@ -41,22 +37,11 @@ BLOCK = 1_000  # episodes of a drawn dataset that share a random stream
 
 
 def make_dataset(name: str, seed: int = 0, episodes: int | None = None) -> Dataset:
-    """One of the paper's datasets, whole (dataset1: 240 MB); arguments as
-    ``chunks``."""
-    parts = list(chunks(name, seed, episodes))
-    whole: dict[str, Any] = {}
-    for key in ("candidates", "measured"):
-        if (arrays := [getattr(part, key) for part in parts])[0] is not None:
-            whole[key] = np.concatenate(arrays)
-    return dataclasses.replace(parts[0], **whole)
-
-
-def chunks(name: str, seed: int = 0, episodes: int | None = None) -> Iterator[Dataset]:
-    """One of the paper's datasets, at most 1,000 episodes at a time.
+    """One of the paper's datasets (the whole of dataset1: 240 MB).
 
     Args:
         name: dataset1, dataset2 or dataset3; others are refused, as are the numbers
-            below, before the first chunk is drawn.
+            below.
         seed: of the streams, 0 or greater.
         episodes: the first so many; all when not given.
     """
@@ -66,8 +51,16 @@ def chunks(name: str, seed: int = 0, episodes: int | None = None) -> Iterator[Da
             f"{name} is simulated or recorded. Make {name}.npz with python -m "
             f"benchmarks.paper.datasets {name} --out DIR, in the repository"
         )
-    counts = [min(BLOCK, total - begin) for begin in range(0, total, BLOCK)]
-    return (_drawn(name, seed, block, count) for block, count in enumerate(counts))
+    pairs = [streams(name, seed, block) for block in range(-(-total // BLOCK))]
+    blocks = [
+        draw.random((min(BLOCK, total - number * BLOCK), NUM_CANDIDATES, 3))
+        for number, (draw, _) in enumerate(pairs)
+    ]
+    candidates, measured = np.concatenate(blocks), None
+    if name == "dataset3":  # one block
+        measured = RANGES.denormalise(candidates) * SCALE + BIAS_DEG
+        measured += pairs[0][1].normal(0.0, NOISE_STD_DEG, measured.shape)
+    return Dataset(name, candidates, measured, ranges=RANGES, seed=seed)
 
 
 def checked_size(name: str, seed: int, episodes: int | None) -> int:
@@ -82,16 +75,6 @@ def checked_size(name: str, seed: int, episodes: int | None) -> int:
             f"episodes must be in [1, {EPISODES[name]}] for {name}, got {total}"
         )
     return total
-
-
-def _drawn(name: str, seed: int, block: int, count: int) -> Dataset:
-    draw, noise = streams(name, seed, block)
-    candidates = draw.random((count, NUM_CANDIDATES, 3))
-    measured = None
-    if name == "dataset3":
-        measured = RANGES.denormalise(candidates) * SCALE + BIAS_DEG
-        measured += noise.normal(0.0, NOISE_STD_DEG, measured.shape)
-    return Dataset(name, candidates, measured, ranges=RANGES, seed=seed)
 
 
 def streams(

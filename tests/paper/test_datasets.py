@@ -31,8 +31,9 @@ from jaxcal.paper.datasets import (
     NOISE_STD_DEG,
     RANGES,
     SCALE,
-    chunks,
+    streams,
 )
+from jaxcal.paper.datasets import make_dataset as drawn
 
 # A loaded machine is no failure.
 settings.register_profile("patient", deadline=None)
@@ -56,18 +57,15 @@ def test_sizes_are_those_of_table_3() -> None:
             50,
             3,
         )
-    first = next(chunks("dataset1"))
+    first = drawn("dataset1", episodes=1000)
     assert first.candidates.shape == (1000, 50, 3) and first.measured is None
 
 
 @pytest.mark.slow
-def test_the_whole_of_dataset_1_comes_in_chunks() -> None:
-    total, mean = 0, np.zeros(3)
-    for chunk in chunks("dataset1"):
-        total += chunk.num_episodes
-        mean += chunk.candidates.sum(axis=(0, 1))
-    assert total == 200_000
-    np.testing.assert_allclose(mean / total / 50, 0.5, atol=1e-3)
+def test_the_whole_of_dataset_1_is_uniform() -> None:
+    points = drawn("dataset1").candidates
+    assert len(points) == 200_000
+    np.testing.assert_allclose(points.mean(axis=(0, 1)), 0.5, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", [n for n in NAMES if n != "dataset5"])
@@ -92,13 +90,13 @@ def test_the_seed_decides_and_fewer_are_the_first_of_more(name: str) -> None:
         np.testing.assert_array_equal(part.measured, whole.measured[:4])
 
 
-def test_chunks_are_the_dataset() -> None:
-    pieces = list(chunks("dataset1", 3, 2500))
-    assert [piece.num_episodes for piece in pieces] == [1000, 1000, 500]
-    np.testing.assert_array_equal(
-        np.concatenate([piece.candidates for piece in pieces]),
-        make_dataset("dataset1", 3, 2500).candidates,
-    )
+def test_every_thousand_episodes_have_a_stream_of_their_own() -> None:
+    whole = drawn("dataset1", 3, 2500).candidates
+    assert len(whole) == 2500
+    for block, count in enumerate((1000, 1000, 500)):
+        draw, _ = streams("dataset1", 3, block)
+        part = whole[1000 * block :][:count]
+        np.testing.assert_array_equal(part, draw.random((count, 50, 3)))
 
 
 def test_no_dataset_shares_a_candidate_with_another_or_with_itself() -> None:
@@ -137,7 +135,7 @@ def test_dataset_3_is_table_1_plus_noise() -> None:
 )
 def test_bad_requests_are_named(arguments: tuple[object, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        chunks(*arguments)  # type: ignore[arg-type]  # bad on purpose
+        drawn(*arguments)  # type: ignore[arg-type]  # bad on purpose
 
 
 def test_bad_arrays_are_named() -> None:
