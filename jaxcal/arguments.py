@@ -4,11 +4,11 @@ A command is a function, its docstring its help. A parameter is an argument, a
 keyword-only one an option; one whose type is a dataclass stands for options, its
 fields. ``Annotated[T, ...]`` says more of one: its help and, where the type does not
 tell, what stands for its value; two numbers are its range, a list its choices, a
-function makes the value of a text. An underscore at the end is no part of a name. A
-``bool | None`` has a flag for yes and one for no. Options of a dataclass with a
-``TITLE`` stand under it in the help, and under its ``ABOUT``, if any; ``RARE``, True or
-names of its fields, are those that only ``--help all`` shows. ``Was(name)`` is a name
-that an option had in 0.2: it works, and warns, until 0.4.
+function makes the value of a text. An underscore at the end is no part of a name.
+Options of a dataclass with a ``TITLE`` stand under it in the help, and under its
+``ABOUT``, if any; ``RARE``, True or names of its fields, are those that only ``--help
+all`` shows. ``Was(name)`` is a name that an option had in 0.2: it works, and warns,
+until 0.4.
 """
 
 from __future__ import annotations
@@ -184,12 +184,10 @@ def _add(
 ) -> argparse.Action:
     kind: Any = hint
     said: tuple[Any, ...] = ()
-    may_be_none = False
     while (optional := type(None) in (parts := typing.get_args(kind))) or (
         typing.get_origin(kind) is typing.Annotated
     ):
         kind, said = parts[0], said if optional else parts[1:]
-        may_be_none |= optional
     text, metavar, *_ = *(word for word in said if isinstance(word, str)), "", ""
     parse = next(filter(callable, said), None)
     limits: tuple[float, ...] = next((x for x in said if isinstance(x, tuple)), ())
@@ -207,8 +205,7 @@ def _add(
         shown = metavar or _METAVARS.get(one, name.upper())
         more["metavar"] = shown if option or metavar else name
     if kind is bool:
-        yes_no = argparse.BooleanOptionalAction
-        more["action"] = yes_no if may_be_none else "store_true"
+        more["action"] = "store_true"
     elif origin is list and (parse is None or typing.get_origin(one) is list):
         more["action"] = "append"
     elif origin is tuple and parts[-1] is Ellipsis:
