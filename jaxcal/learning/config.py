@@ -49,12 +49,26 @@ def path_of(thing: type) -> str:
     return f"{thing.__module__.removeprefix(_OWN)}:{thing.__qualname__}"
 
 
-def run_file(path: str | pathlib.Path, name: str) -> Any:
+def of_file(path: str) -> Any:
+    """The module of a Python file, which may import its neighbours; a ValueError where
+    it is missing or fails."""
+    name = f"{_OWN}{path}"
+    if name in sys.modules:
+        return sys.modules[name]
+    if not pathlib.Path(path).is_file():
+        raise ValueError(f"file {path} does not exist")
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None  # it is a Python file
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look up the module there
-    spec.loader.exec_module(module)
+    sys.path.insert(0, folder := str(pathlib.Path(path).parent.resolve()))
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise ValueError(f"{path}: {type(error).__name__}: {error}") from error
+    finally:
+        sys.path.remove(folder)
     return module
 
 
@@ -62,13 +76,9 @@ def named(path: str) -> Any:
     """What ``module:Name`` or ``file.py:Name`` names; else a ValueError."""
     place, _, name = path.rpartition(":")
     try:
-        if place.endswith(".py"):
-            name_of_file = f"{_OWN}{place}"
-            module = sys.modules.get(name_of_file) or run_file(place, name_of_file)
-        else:
-            module = importlib.import_module(place)
-        return getattr(module, name)
-    except (ImportError, AttributeError, OSError) as error:
+        find = of_file if place.endswith(".py") else importlib.import_module
+        return getattr(find(place), name)
+    except (ImportError, AttributeError) as error:
         raise ValueError(
             f"{path} must name an existing MODULE:NAME or FILE.py:NAME: {error}"
         ) from error

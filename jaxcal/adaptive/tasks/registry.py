@@ -9,14 +9,12 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
-import pathlib
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from jaxcal.adaptive.rules import Priced, StateRule
 from jaxcal.extras import installed
-from jaxcal.learning.config import named, run_file
+from jaxcal.learning.config import named, of_file
 
 _GROUP = "jaxcal.tasks"  # entry points
 _OWN = {"knee": "jaxcal.adaptive.tasks.knee:ENTRY"}
@@ -49,7 +47,9 @@ def load(name: str) -> Entry:
     ``ENTRY``; a ValueError where there is no such task, or a file that fails or has no
     entry."""
     if name.endswith(".py"):
-        entry = _of_file(pathlib.Path(name))
+        entry = getattr(of_file(name), "ENTRY", None)
+        if entry is None:
+            raise ValueError(f"task file {name} must define ENTRY = Entry(...)")
     elif name in _OWN:
         entry = named(_OWN[name])
     elif name in installed(_GROUP):
@@ -62,22 +62,6 @@ def load(name: str) -> Entry:
     if not isinstance(entry, Entry):
         raise ValueError(f"task {name} must be an Entry, got {type(entry).__name__}")
     return entry
-
-
-def _of_file(path: pathlib.Path) -> Any:
-    if not path.is_file():
-        raise ValueError(f"task file {path} does not exist")
-    sys.path.insert(0, folder := str(path.parent.resolve()))  # as Python runs a file
-    try:
-        module = run_file(path, f"{_GROUP} {path}")
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}"
-        raise ValueError(f"task file {path}: {reason}") from error
-    finally:
-        sys.path.remove(folder)
-    if not hasattr(module, "ENTRY"):
-        raise ValueError(f"task file {path} must define ENTRY = Entry(...)")
-    return module.ENTRY
 
 
 def options_from(entry: Entry, given: Sequence[str]) -> dict[str, Any]:
