@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jaxcal.learning.core import ppo
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import presets
-from jaxcal.learning.training.run import updates
+from jaxcal.learning.training.run import compiled_update
 
 
 def measure(config: Any, number: int, seeds: int, num_updates: int) -> dict[str, float]:
@@ -37,9 +37,9 @@ def measure(config: Any, number: int, seeds: int, num_updates: int) -> dict[str,
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
     begin = jax.vmap(lambda key: ppo.begin(config.ppo, learner, key))
     state = devices.replicate(jax.jit(begin)(keys), mesh)
-    update: Any = updates(config.ppo, learner, mesh, max(num_updates, 1), seeds)
+    update: Any = compiled_update(config.ppo, learner, mesh, seeds)
     used = time.process_time()
-    update = update.lower(state, jnp.int32(1)).compile()
+    update = update.lower(state).compile()
     used, memory = time.process_time() - used, update.memory_analysis()
     numbers = exchanged(update.as_text())
     needs: dict[str, float] = {
@@ -53,7 +53,8 @@ def measure(config: Any, number: int, seeds: int, num_updates: int) -> dict[str,
         return needs
     for count in (1, num_updates):
         wall, used = time.perf_counter(), time.process_time()
-        state, _ = update(state, jnp.int32(count))
+        for _ in range(count):
+            state, _ = update(state)
         jax.block_until_ready(state.num_updates)
         wall, used = time.perf_counter() - wall, time.process_time() - used
     return needs | {

@@ -44,17 +44,17 @@ import dataclasses, jax
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.core import ppo
 from jaxcal.learning.training import presets
-from jaxcal.learning.training.run import updates
+from jaxcal.learning.training.run import compiled_update
 processes.keep_compiled_programs()
 config = presets.with_values(presets.load("compact"), {
     "episodes_per_update": EPISODES, "num_minibatches": EPISODES // 512})
 jax.devices()
 before = mib("VmRSS")
 state = ppo.begin(config.ppo, config.learners[0], jax.random.key(0))
-update = updates(config.ppo, config.learners[0])
+update = compiled_update(config.ppo, config.learners[0])
 for _ in range(2):
-    state, metrics = update(state, 1)
-    float(metrics["reward_mean"][0])
+    state, metrics = update(state)
+    float(metrics["reward_mean"])
 print(json.dumps({"before": before, "last": mib("VmRSS"), "peak": mib("VmHWM")}))
 """
 )

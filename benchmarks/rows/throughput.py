@@ -19,7 +19,7 @@ from benchmarks.harness import (
 )
 from jaxcal.learning.core import ppo
 from jaxcal.learning.training import presets
-from jaxcal.learning.training.run import updates
+from jaxcal.learning.training.run import compiled_update
 
 NAME = "throughput"
 TITLE = "Training throughput, paper preset (3.5 M parameters)"
@@ -31,11 +31,11 @@ def ours() -> Callable[[], None]:
     """An update of the paper preset."""
     config = presets.load("paper")
     learner = config.learners[0]
-    step = updates(config.ppo, learner)
+    step = compiled_update(config.ppo, learner)
     held = [ppo.begin(config.ppo, learner, jax.random.key(0))]
 
     def update() -> None:
-        state, metrics = step(held[0], 1)
+        state, metrics = step(held[0])
         held[0] = state
         jax.block_until_ready(metrics["reward_mean"])
 

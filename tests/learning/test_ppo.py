@@ -25,7 +25,7 @@ from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.training.presets import TrainConfig
-from jaxcal.learning.training.run import Recipe, run, updates
+from jaxcal.learning.training.run import Recipe, compiled_update, run
 from jaxcal.selection import exact_batch
 
 SMALL = NetworkConfig(width=8, encoder_rounds=1)
@@ -362,24 +362,20 @@ def test_an_update_in_slices_is_that_of_the_whole(size):
         np.testing.assert_allclose(a, b, atol=2e-5)
 
 
-def test_cutting_a_run_into_calls_changes_no_bit_and_a_seed_compiles_nothing():
+def test_an_update_repeats_to_the_bit_and_a_seed_compiles_nothing():
     config, (learner,) = PROBE.ppo, PROBE.learners
-    update = updates(config, learner, None, 16)  # as ``run`` asks for it
-    assert updates(config, learner, None, 16) is update
+    update = compiled_update(config, learner, None, 0)  # as ``run`` asks for it
+    assert compiled_update(config, learner, None, 0) is update
     ends = []
-    for counts in ((1,) * 6, (6,), (2, 4)):
+    for _ in range(2):
         state = ppo.begin(config, learner, jax.random.key(3))
-        rows = []
-        for count in counts:
-            state, metrics = update(state, jnp.int32(count))
-            assert metrics["rewards"].shape == (16, 64)
-            rows += list(np.asarray(metrics["reward_mean"])[:count])
-        ends.append((state, np.array(rows)))
-    for one, other in zip(*(jax.tree.leaves(end) for end in ends[:2]), strict=True):
+        for _ in range(3):
+            state, metrics = update(state)
+            assert metrics["rewards"].shape == (64,)
+        ends.append((state, metrics))
+    for one, other in zip(*map(jax.tree.leaves, ends), strict=True):
         np.testing.assert_array_equal(one, other)
-    for one, other in zip(*(jax.tree.leaves(end) for end in ends[1:]), strict=True):
-        np.testing.assert_array_equal(one, other)
-    update(ppo.begin(config, learner, jax.random.key(4)), jnp.int32(1))
+    update(ppo.begin(config, learner, jax.random.key(4)))
     assert update._cache_size() == 1
 
 

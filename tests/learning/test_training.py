@@ -33,7 +33,7 @@ from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.checkpoint import CheckpointError
 from jaxcal.learning.training.postures import Validation
 from jaxcal.learning.training.presets import TrainConfig
-from jaxcal.learning.training.run import updates
+from jaxcal.learning.training.run import compiled_update
 from jaxcal.selection.policy.by_checkpoint import load_policy
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -86,7 +86,7 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
 
 def test_updates_compile_once_and_change_every_weight(finished, tmp_path):
     (learner,) = CONFIG.learners
-    assert updates(CONFIG.ppo, learner, None, 16, 0)._cache_size() == 1
+    assert compiled_update(CONFIG.ppo, learner, None, 0)._cache_size() == 1
     begun = training.train(CONFIG, tmp_path, num_updates=0).params
     moved = jax.tree.map(lambda a, b: (a != b).any(), begun, finished[1].params)
     # The value reads every part of the network, the policy all but the critic.
@@ -757,7 +757,7 @@ def test_an_update_is_compiled_by_options_that_change_only_rounding(monkeypatch)
     passed: dict = {}
     with monkeypatch.context() as patch:
         patch.setattr(jax, "jit", lambda function, **rest: passed.update(rest))
-        updates.__wrapped__(CONFIG.ppo, CONFIG.learners[0])
+        compiled_update.__wrapped__(CONFIG.ppo, CONFIG.learners[0])
     assert passed["compiler_options"] == options
 
     def sums(x: jax.Array) -> jax.Array:

@@ -2,7 +2,7 @@
 
 A run folder holds ``metrics.csv`` (a row per update; means over seeds),
 ``last_rewards.npy`` (the last 1,000 rewards of the first task) and ``checkpoint/``. The
-loop is on the host, over calls of several updates, so that a signal stops it between.
+loop is on the host, an update at a time, so that a signal stops it between.
 """
 
 from __future__ import annotations
@@ -37,8 +37,6 @@ _LOSSES = (
 )  # fmt: skip
 _SKIPS = 5  # updates in a row, not finite, that end a run
 _LAST = 1000  # episodes whose rewards are kept
-_UPDATES = 16  # updates in one call
-_CALL_SECONDS = 2.0  # of one call: what a signal waits for
 
 
 class DivergedError(ArithmeticError):
@@ -95,62 +93,38 @@ class Report:
 
 
 @functools.lru_cache(maxsize=32)
-def updates(
-    config: PPOConfig,
-    learner: Learner,
-    mesh: Mesh | None = None,
-    at_most: int = 1,
-    seeds: int = 0,
+def compiled_update(
+    config: PPOConfig, learner: Learner, mesh: Mesh | None = None, seeds: int = 0
 ) -> Callable[..., tuple[TrainState, ppo.Metrics]]:
-    """Several updates in one compiled call; nothing is compiled for another seed.
+    """One update, (state, *given) -> the next state and metrics; ``state`` is donated.
+    Nothing is compiled for another seed.
 
     On a mesh with axis ``sets`` the devices share every update, with axis ``seeds``
     each trains some of the seeds by itself. Of several ``seeds`` each leaf of the state
-    has a leading axis of so many; 0 for one without that axis.
-
-    Returns:
-        (state, count, *given) -> the state after ``count <= at_most`` updates, and
-        metrics with a leading axis ``at_most``, zero from ``count`` on. ``state`` is
-        donated. The program does not depend on ``count``, so dividing a run into calls
-        in another way changes no bit of it.
+    and the metrics has a leading axis of so many; 0 for one without that axis.
     """
     spread = mesh is not None and mesh.axis_names == ("seeds",)
     one = ppo.make_update(config, learner, None if spread else mesh)
 
-    def several(state: TrainState, count: jax.Array, given: tuple[Any, ...]) -> Any:
-        def update(state: TrainState) -> tuple[TrainState, ppo.Metrics]:
+    def all_seeds(state: TrainState, given: tuple[Any, ...]) -> Any:
+        if not seeds:
             return one(state, *given)
+        # On a CPU one after another: several at once do not fit a core's cache.
+        at_once = None if jax.default_backend() == "cpu" else seeds
+        return jax.lax.map(lambda state: one(state, *given), state, batch_size=at_once)
 
-        all_seeds: Any = update
-        if seeds:
-            # On a CPU one after another: several at once do not fit a core's cache.
-            at_once = None if jax.default_backend() == "cpu" else seeds
-            all_seeds = functools.partial(jax.lax.map, update, batch_size=at_once)
-
-        all_seeds = jax.jit(all_seeds)  # traced once, for the shapes and for the loop
-
-        def step(number: jax.Array, carry: Any) -> Any:
-            state, kept = carry
-            state, metrics = all_seeds(state)
-            kept = jax.tree.map(lambda k, m: k.at[number].set(m), kept, metrics)
-            return state, kept
-
-        shapes = jax.eval_shape(all_seeds, state)[1]
-        kept = jax.tree.map(lambda m: jnp.zeros((at_most, *m.shape), m.dtype), shapes)
-        return jax.lax.fori_loop(0, count, step, (state, kept))
-
-    def call(state: TrainState, count: jax.Array, *given: Any) -> Any:
+    def call(state: TrainState, *given: Any) -> Any:
         if not spread:
-            return ppo.placed(several(state, count, given), mesh)
-        by_seed, copied = PartitionSpec("seeds"), PartitionSpec()
+            return ppo.placed(all_seeds(state, given), mesh)
+        by_seed = PartitionSpec("seeds")
         on_each = jax.shard_map(
-            several,
+            all_seeds,
             mesh=mesh,
-            in_specs=(by_seed, copied, copied),
-            out_specs=(by_seed, PartitionSpec(None, "seeds")),
+            in_specs=(by_seed, PartitionSpec()),
+            out_specs=by_seed,
             check_vma=False,
         )
-        return ppo.placed(on_each(state, count, given), mesh)
+        return ppo.placed(on_each(state, given), mesh)
 
     return jax.jit(call, donate_argnums=0, compiler_options=_compiler_options())
 
@@ -197,7 +171,7 @@ def run(
     everywhere = devices.replicate(recipe.given, mesh)
     last = config.ppo.num_updates if num_updates is None else num_updates
     seeds = len(recipe.seeds) if len(recipe.seeds) > 1 else 0
-    count, timed, broken = 1, False, ""
+    broken = ""
     in_row = np.zeros(len(recipe.seeds), int)  # updates skipped
     with contextlib.ExitStack() as held:
         if devices.is_first():
@@ -210,33 +184,22 @@ def run(
             recorder = _Recorder(root, recipe, report, last, before, done, recent)
             held.enter_context(contextlib.closing(recorder))
         while done < last and not broken and not devices.any_process(should_stop()):
-            begun = time.perf_counter()
-            at_most, given = _UPDATES, everywhere
-            learner = recipe.learners[done % len(recipe.learners)]
+            given, learner = everywhere, recipe.learners[done % len(recipe.learners)]
             if done < recipe.num_imitated:
                 assert recipe.imitate is not None  # there are updates that imitate
                 learner, shown = recipe.imitate(done)
-                at_most, given = 1, (devices.replicate(shown, mesh, "sets"),)
-            elif len(recipe.learners) > 1:
-                at_most = 1  # the next update has another program
-            count = min(count, at_most, last - done)
-            update = updates(config.ppo, learner, mesh, at_most, seeds)
+                given = (devices.replicate(shown, mesh, "sets"),)
+            update = compiled_update(config.ppo, learner, mesh, seeds)
             with collective():
-                state, metrics = update(state, np.int32(count), *given)
-                # One transfer for all that these updates measured.
-                rows = jax.device_get(devices.local(metrics))
-            first, done = done, done + count
-            for number in range(count):
-                fine = np.ravel(rows["skipped"][number]) == 0.0
-                in_row = np.where(fine, 0, in_row + 1)
-                if in_row.min() == _SKIPS:
-                    broken = _broken(rows, number, first + number + 1)
+                state, metrics = update(state, *given)
+                # One transfer for all that the update measured.
+                row = jax.device_get(devices.local(metrics))
+            done += 1
+            in_row = np.where(np.ravel(row["skipped"]) == 0.0, 0, in_row + 1)
+            if in_row.min() == _SKIPS:
+                broken = _broken(row, done)
             if recorder is not None:
-                recorder.note(state, first, count, rows, save=not broken)
-            seconds = (time.perf_counter() - begun) / count
-            # The first call also compiled, so the second is of one update too.
-            fit = int(_CALL_SECONDS / seconds) if timed else 1
-            count, timed = devices.on_first(functools.partial(max, fit, 1)), True
+                recorder.note(state, done, row, save=not broken)
         if recorder is not None:
             recorder.close()  # rows before the checkpoint that counts them
             recorder.save(state, done)
@@ -245,9 +208,9 @@ def run(
     return state
 
 
-def _broken(rows: Mapping[str, Any], number: int, update: int) -> str:
-    names = [n for n in ("policy_loss", "value_loss", *_LOSSES) if n in rows]
-    values = {name: float(np.mean(rows[name][number])) for name in names}
+def _broken(metrics: Mapping[str, Any], update: int) -> str:
+    names = [n for n in ("policy_loss", "value_loss", *_LOSSES) if n in metrics]
+    values = {name: float(np.mean(metrics[name])) for name in names}
     name, value = next((n, v) for n, v in values.items() if not np.isfinite(v))
     return (
         f"diverged: {name} is {value} in {_SKIPS} consecutive updates, the last of "
@@ -285,40 +248,29 @@ class _Recorder:
         first = ("update", recipe.config.ppo.unit, "seconds", "reward_mean")
         columns = (*first, *recipe.columns, *_LOSSES, *recipe.measured)
         self._rows = _Table(self.root / "metrics.csv", self.reported, columns)
-        self._begun = self._validated = self._noted = time.perf_counter()
+        self._begun = self._validated = time.perf_counter()
         self._saved = -np.inf  # soon after the beginning too
         self._of_seeds: list[dict[str, float]] = []  # of the last validation
         self._skipped = 0
         self._judging_s: list[float] = []  # of each validation; the first compiles
 
     def note(
-        self,
-        state: TrainState,
-        first: int,
-        count: int,
-        metrics: Mapping[str, Any],
-        save: bool = True,
+        self, state: TrainState, done: int, metrics: Mapping[str, Any], save: bool
     ) -> None:
-        """Record the metrics of ``count`` updates; validate and save when due."""
+        """Record the metrics of an update; validate and save when due."""
         recipe, config, now = self.recipe, self.recipe.config, time.perf_counter()
-        for number in range(count):
-            rewards = metrics["rewards"][number] if "rewards" in metrics else ()
-            if (first + number) % len(recipe.learners) == 0:
-                self.recent = np.concatenate([self.recent, np.ravel(rewards)])[-_LAST:]
-            # Only the end of a call is timed: interpolate.
-            at = self._noted + (now - self._noted) * (number + 1) / count
-            done = first + number + 1
-            self._skipped += bool(np.any(metrics["skipped"][number]))
-            row = {name: _mean(values[number]) for name, values in metrics.items()}
-            row |= {"update": done, "seconds": self._seconds(at)}
-            row[config.ppo.unit] = done * config.ppo.played_per_update
-            if number == count - 1:
-                self._validate(state, row)
-            self._rows.add(row)
-        self._noted = now
+        if (done - 1) % len(recipe.learners) == 0:
+            rewards = np.ravel(metrics.get("rewards", ()))
+            self.recent = np.concatenate([self.recent, rewards])[-_LAST:]
+        self._skipped += bool(np.any(metrics["skipped"]))
+        row = {name: _mean(values) for name, values in metrics.items()}
+        row |= {"update": done, "seconds": self._seconds(now)}
+        row[config.ppo.unit] = done * config.ppo.played_per_update
+        self._validate(state, row)
+        self._rows.add(row)
         if save and now - self._saved > config.save_every:
             self._saved = now
-            self.save(state, first + count)
+            self.save(state, done)
 
     def _validate(self, state: TrainState, row: dict[str, float]) -> None:
         """Validate and report when due, and at the first and last update."""
