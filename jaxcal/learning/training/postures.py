@@ -9,7 +9,6 @@ those and their best completion.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import pathlib
@@ -90,25 +89,6 @@ def draw(learner: Postures, teacher: Teacher, key: jax.Array) -> Lesson:
 def _drawn(key: jax.Array, num_sets: int, task: Any) -> tuple[jax.Array, jax.Array]:
     sets = jax.vmap(task.reset)(jax.random.split(key, num_sets))
     return sets.candidates, sets.available
-
-
-class Lessons:
-    """Lessons ``0`` to ``last - 1``; a thread prepares the next during an update."""
-
-    def __init__(self, prepare: Callable[[int], Lesson], last: int) -> None:
-        self._prepare, self._last = prepare, last
-        self._pool = ThreadPoolExecutor(1)
-        self._asked: dict[int, Future[Lesson]] = {}
-
-    def at(self, index: int) -> Lesson:
-        for i in range(index, min(index + 2, self._last)):
-            if i not in self._asked:
-                self._asked[i] = self._pool.submit(self._prepare, i)
-        return self._asked.pop(index).result()
-
-    def close(self) -> None:
-        """Cancel lessons not begun, without waiting for one in preparation."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 @struct.dataclass
@@ -256,7 +236,10 @@ def train(
     def imitate(index: int) -> tuple[Learner, Lesson]:
         learner = learners[index % len(learners)]
         imitation = Imitation(learner.config, learner.task, learner.network)
-        return imitation, lessons.at(index)
+        for i in range(index, min(index + 2, imitated)):  # the next during this update
+            if i not in lessons:
+                lessons[i] = pool.submit(lesson, i)
+        return imitation, lessons.pop(index).result()
 
     validate = None
     if validation is not None:
@@ -271,5 +254,8 @@ def train(
         num_imitated=imitated,
         imitate=imitate,
     )
-    with contextlib.closing(Lessons(lesson, imitated)) as lessons:
+    pool, lessons = ThreadPoolExecutor(1), dict[int, Future[Lesson]]()
+    try:
         return run(recipe, folder, num_updates=last, **rest)
+    finally:  # without waiting for a lesson in preparation
+        pool.shutdown(wait=False, cancel_futures=True)
