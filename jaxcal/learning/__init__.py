@@ -27,8 +27,7 @@ if TYPE_CHECKING:
         step,
     )
     from jaxcal.learning.environments.task import Task
-    from jaxcal.learning.training.presets import TrainConfig
-    from jaxcal.learning.training.presets import load as preset
+    from jaxcal.learning.training.presets import TrainConfig, preset
 
 __all__ = [
     "Environment",
@@ -79,8 +78,7 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     for module, names in _HOME.items():
         if name in names:
-            home = importlib.import_module(f"jaxcal.learning.{module}")
-            return getattr(home, "load" if name == "preset" else name)
+            return getattr(importlib.import_module(f"jaxcal.learning.{module}"), name)
     raise AttributeError(f"module 'jaxcal.learning' has no attribute {name!r}")
 
 

@@ -139,6 +139,9 @@ def load(name: str) -> TrainConfig:
     return installed(_GROUP)[name].load()
 
 
+preset = load  # as jaxcal.learning calls it
+
+
 def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     """A configuration with single fields changed, in whichever part they are; in every
     task, refused where tasks differ in it. Where more than n + 1 postures are asked
