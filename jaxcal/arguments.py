@@ -328,15 +328,16 @@ def several(kind: Callable[[str], T], what: str) -> Callable[[str], list[T]]:
     return parse
 
 
-def levels(text: str) -> list[float]:
-    """One number, or one for each output; 1,5 is neither."""
+def levels(text: str) -> float | list[float]:
+    """One number, or a list of one for each output; 1,5 is neither."""
     if re.fullmatch(r"\s*\d+,\d+\s*", text):
         whole = text.strip()
         point, two = whole.replace(",", "."), whole.replace(",", ".0,") + ".0"
         raise argparse.ArgumentTypeError(
             f"{whole!r} may be one number or two: write {point}, or {two}"
         )
-    return several(number_type(float), "numbers")(text)
+    values: list[float] = several(number_type(float), "numbers")(text)
+    return values[0] if len(values) == 1 else values
 
 
-Numbers = Annotated[list[float] | None, levels]
+Numbers = Annotated[float | list[float] | None, levels]

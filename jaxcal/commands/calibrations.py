@@ -198,9 +198,8 @@ class NoiseOptions:
     ] = None
     weights: Annotated[str | None, "column of relative weights", "W"] = None
 
-    def noise(self, machine: Any, stds: list[float] | None) -> Any:
+    def noise(self, machine: Any, std: float | list[float] | None) -> Any:
         """``noise`` and ``noise_std`` of ``identify``, by --noise and --play."""
-        std = stds[0] if stds and len(stds) == 1 else stds
         if self.play is None:
             return {"noise_std": std}
         if not is_arm(machine):

@@ -57,7 +57,7 @@ class DesignOptions:
         design = Design(
             candidates,
             model,
-            noise=None if self.noise is None else _one_or_all(self.noise),
+            noise=self.noise,
             available=mask,
             required=self.required,
             max_replicates=self.replicates,
@@ -193,7 +193,7 @@ def plan(
     of_arm: ArmOptions,
     *,
     accuracy: Annotated[
-        list[float],
+        float | list[float],
         "largest allowed standard error of a prediction: one, or one per output",
         "E",
         levels,
@@ -208,7 +208,7 @@ def plan(
     if of_design.noise is None:
         raise ValueError("--noise is missing: the standard deviation of a measurement")
     result = of_design.design(read_table(file), of_arm).plan(
-        _one_or_all(accuracy), criterion=criterion
+        accuracy, criterion=criterion
     )
     header = ("k", "distinct", "standard_error", "least_error")
     rows = [
@@ -244,10 +244,6 @@ def _rows_of(subset: Table, table: Table) -> NDArray[np.int64]:
             "selection is from another table"
         )
     return rows
-
-
-def _one_or_all(values: list[float]) -> float | list[float]:
-    return values[0] if len(values) == 1 else values
 
 
 def _show(selection: Selection, table: Table, output: Output) -> None:
