@@ -42,21 +42,20 @@ class Dataset:
     sha256: str | None = None  # of the file it was read from
 
     def __post_init__(self) -> None:
-        axes = {"candidates": ("episodes", "M", "n")}
+        arrays = {
+            "candidates": array_of("candidates", self.candidates, "episodes", "M", "n")
+        }
+        sizes = arrays["candidates"].shape[:2]
         if self.measured is not None:
-            axes["measured"] = ("episodes", "M", "m")
-        sizes: dict[str, Any] = {}
-        for name, letters in axes.items():
-            shape = [sizes.get(letter, letter) for letter in letters]
-            array = array_of(name, getattr(self, name), *shape)
+            arrays["measured"] = array_of("measured", self.measured, *sizes, "m")
+        for name, array in arrays.items():
             if 0 in array.shape:
                 raise ValueError(
                     f"{name} must have no axis of length 0, got {array.shape}"
                 )
-            sizes |= dict(zip(letters, array.shape, strict=True))
             object.__setattr__(self, name, array)
         if self.available is not None:
-            mask = array_of("available", self.available, sizes["episodes"], sizes["M"])
+            mask = array_of("available", self.available, *sizes)
             require_none(~np.isin(mask, (0, 1)), mask, "available must be 1 or 0")
             object.__setattr__(self, "available", mask == 1)
         if self.ranges is not None and len(self.ranges.low) != self.num_inputs:

@@ -86,9 +86,10 @@ play = jax.jit(PLAYED.rollout)  # op by op it would be hundreds of programs
 @pytest.mark.slow
 def test_two_updates_of_a_length_play_what_one_of_twice_the_length_does():
     short = PLAYED
-    long = short.with_config(
-        dataclasses.replace(short.config, stream_length=16, decisions_per_update=64)
+    longer = dataclasses.replace(
+        short.config, stream_length=16, decisions_per_update=64
     )
+    long = dataclasses.replace(short, config=longer)
     params = short.init(jax.random.key(0), 1.0)
     begun = short.begin(jax.random.split(jax.random.key(1), 4), 1.0)
     first, middle, _ = play(params, begun, 1.0)

@@ -107,10 +107,6 @@ class Postures:
         m, n = jax.eval_shape(self.task.reset, key).candidates.shape
         return initial(self.network, key, m, n, self.task.num_decisions)
 
-    def with_config(self, config: EpisodesConfig) -> Postures:
-        """This learner with another configuration."""
-        return dataclasses.replace(self, config=config)
-
     def begin(self, keys: jax.Array, *given: Any) -> jax.Array:
         """(B, 2) uint32, data of the keys of the rows, of which (B,) are the first."""
         return jax.random.key_data(keys)

@@ -27,14 +27,12 @@ Metrics = dict[str, jax.Array]
 
 
 class Learner(Protocol):
-    """What is trained: it plays and it scores. ``given`` are arrays that go through
-    ``train`` or an update, such as a task's tables: other values compile nothing."""
+    """What is trained: it plays and it scores; a dataclass with a field ``config``, of
+    which ``TRACED`` may be arrays. ``given`` are arrays that go through ``train`` or an
+    update, such as a task's tables: other values compile nothing."""
 
     def __hash__(self) -> int:
         """Hashable: a static argument of ``jit``."""
-
-    def with_config(self, config: Any) -> Learner:
-        """This learner with a configuration of which ``TRACED`` may be arrays."""
 
     def init(self, key: jax.Array, *given: Any) -> Any:
         """Parameters before training."""
@@ -281,7 +279,7 @@ def make_update(
 
     def update(before: TrainState, *given: Any) -> tuple[TrainState, Metrics]:
         ppo = _with_values(config, before.values)
-        trained = learner.with_config(ppo)
+        trained: Learner = dataclasses.replace(learner, config=ppo)  # type: ignore[type-var]  # a dataclass
         key = jax.random.wrap_key_data(before.key)
         key, key_epochs = jax.random.split(key)
         rollout_state = placed(before.rollout_state, mesh, "sets")

@@ -76,10 +76,6 @@ class Streams:
     environment: Environment
     network: nn.Module  # of what is observed: masked logits (..., A), values (...)
 
-    def with_config(self, config: StreamsConfig) -> Streams:
-        """This learner with another configuration."""
-        return dataclasses.replace(self, config=config)
-
     def init(self, key: jax.Array, task: Any) -> Any:
         """Parameters before training."""
         state = self.environment.reset(task, key)
