@@ -566,7 +566,7 @@ def _slipped(sensor: Sensor, seed: int) -> tuple[float, ...]:
     """Shares of the joints' slips: seen by 6, 24, at best, of an exact arm; holds."""
     rng = np.random.default_rng(seed)
     model = arm(6, sensor)
-    bent = model.with_misfit()
+    bent = model.fitting.misfit_model()
     prior = model.default_prior()
     std, free = np.asarray(prior.std), ~np.isin(model.names, prior.fixed)
     truth = bent.nominal.copy()

@@ -82,7 +82,7 @@ def errors(fit: jaxcal.Calibration, rows: NDArray[np.int64]) -> tuple[float, flo
 
 def choose(k: int) -> NDArray[np.int64]:
     """(k,) views: the first five show where all is, the rest are chosen."""
-    rough = arm().located(load()[:5]).with_misfit()
+    rough = arm().located(load()[:5]).fitting.misfit_model()
     return jaxcal.select(load(), k, "exchange", model=rough, required=range(5)).indices
 
 

@@ -78,7 +78,7 @@ def choose(k: int) -> NDArray[np.int64]:
     while len(first) < 5:
         apart = np.abs(table[:, None, :2] - table[first, :2]).max(axis=-1).min(axis=1)
         first.append(int(apart.argmax()))
-    rough = arm().located(table[first]).with_misfit()
+    rough = arm().located(table[first]).fitting.misfit_model()
     return jaxcal.select(table, k, "exchange", model=rough, required=first).indices
 
 

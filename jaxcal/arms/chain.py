@@ -61,9 +61,7 @@ class SerialChain(Arm, Model):
     recorded = late("jaxcal.arms.files.recordings:recorded")
     write = late("jaxcal.arms.files.write:write")
 
-    @property
-    def fitting(self) -> ArmFitting:
-        return ArmFitting(self)
+    fitting = functools.cached_property(ArmFitting)
 
     @classmethod
     def from_dh(
@@ -222,13 +220,7 @@ class SerialChain(Arm, Model):
 
     def _with_member(self, i: int, sensor: Sensor) -> Self:
         """This arm with another sensor in the place of its member ``i``."""
-        members = [*self.sensor.members]
-        members[i] = sensor
-        return self.measured_with(self.sensor.with_members(members))
-
-    def with_misfit(self) -> Self:
-        """This arm with harmonics of its joints: what the parameters do not explain."""
-        return self._bent
+        return self.measured_with(self.sensor.with_member(i, sensor))
 
     def _with_effects(
         self,
@@ -250,8 +242,9 @@ class SerialChain(Arm, Model):
             new["waves"] = np.zeros((len(harmonics), 4))
         return dataclasses.replace(self, **new)
 
-    @functools.cached_property
-    def _bent(self) -> Self:  # kept, and what it keeps with it
+    @functools.cached_property  # kept, and what it keeps with it
+    def _bent(self) -> Self:
+        """This arm with harmonics of its joints: what the parameters do not explain."""
         if self.harmonics or "R" not in self.joints:
             return self
         return self._with_effects(harmonics=turning(self.joints))

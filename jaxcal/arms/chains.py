@@ -52,9 +52,7 @@ class Chains(Model):
     chains: tuple[SerialChain, ...]
     stands: tuple[tuple[int, ...], ...]
 
-    @property
-    def fitting(self) -> ChainsFitting:
-        return ChainsFitting(self)
+    fitting = functools.cached_property(ChainsFitting)
 
     @classmethod
     def of(cls, chains: Mapping[str, SerialChain]) -> Self:
@@ -219,11 +217,10 @@ class Chains(Model):
         self, sensors: Mapping[int, Sensor], arm: SerialChain, k: int
     ) -> SerialChain:
         """An arm with sensors by number."""
-        members = [*arm.sensor.members]
-        mine = [i for i, number in enumerate(self.stands[k]) if number in sensors]
-        for i in mine:
-            members[i] = sensors[self.stands[k][i]]
-        return arm.measured_with(arm.sensor.with_members(members)) if mine else arm
+        for i, number in enumerate(self.stands[k]):
+            if number in sensors:
+                arm = arm._with_member(i, sensors[number])
+        return arm
 
     def _with_member(self, number: int, sensor: Sensor) -> Self:
         """These chains with another sensor in the place of ``number``."""
@@ -377,13 +374,10 @@ class Chains(Model):
         sizes = [arm.parameter_sizes() for arm in self.chains]
         return np.asarray(self._gather(sizes))
 
-    def with_misfit(self) -> Self:
+    @functools.cached_property  # kept, and what it keeps with it
+    def _bent(self) -> Self:
         """These chains, each with harmonics of its joints."""
-        return self._bent
-
-    @functools.cached_property
-    def _bent(self) -> Self:  # kept, and what it keeps with it
-        return self._each(SerialChain.with_misfit)
+        return self._each(lambda arm: arm._bent)
 
     def calibrated(self, parameters: ArrayLike) -> Self:
         """The chains whose nominal is this one with ``parameters``."""

@@ -31,37 +31,20 @@ class ArmFitting(Fitting):
     unexplained = late("jaxcal.arms.effects:unexplained", of="model")
     verdict = late("jaxcal.arms.verdict:verdict", of="model")
 
+    def __init__(self, model: Any) -> None:
+        super().__init__(model)
+        sensor, joints = model.sensor, enumerate(model.joints, 1)
+        # What harmonics leave of the misfit, which a choice counts as noise.
+        self.misfit_std = sensor.misfit * model.length
+        self.fits_misfit, self.relative = not sensor.local, sensor.relative
+        self.sensed = slice(model.num_joints, model.num_inputs)
+        self.placed = sensor.names
+        self.slips = tuple(f"{'theta' if x == 'R' else 'd'}{i}" for i, x in joints)
+
     def misfit_model(self) -> Model:
         chain: Any = self.model
-        bent: Model = chain.with_misfit()
+        bent: Model = chain._bent
         return bent
-
-    @property
-    def misfit_std(self) -> float:
-        """What harmonics leave of the misfit, which a choice counts as noise."""
-        return self.model.sensor.misfit * self.model.length
-
-    @property
-    def fits_misfit(self) -> bool:
-        return not self.model.sensor.local
-
-    @property
-    def sensed(self) -> slice:
-        return slice(self.model.num_joints, self.model.num_inputs)
-
-    @property
-    def placed(self) -> tuple[str, ...]:
-        return self.model.sensor.names
-
-    @property
-    def slips(self) -> tuple[str, ...]:
-        """The joints' zeros."""
-        zeros = enumerate(self.model.joints, 1)
-        return tuple(f"{'theta' if kind == 'R' else 'd'}{i}" for i, kind in zeros)
-
-    @property
-    def relative(self) -> bool:
-        return self.model.sensor.relative
 
     def distinct(self, commands: Array, measured: Array) -> NDArray[np.intp]:
         kept = [np.zeros(0, dtype=np.intp)]
@@ -141,23 +124,16 @@ class ChainsFitting(Fitting):
     prepared = late("jaxcal.arms.plausible:prepared_chains", of="model")
     verdict = late("jaxcal.arms.verdict:verdict_of_chains", of="model")
 
-    @property
-    def misfit_std(self) -> float:
-        scales = [self.model._scale(k) for k in range(len(self.model.chains))]
-        both = zip(self.model.chains, scales, strict=True)
-        return max(arm.fitting.misfit_std / float(std.min()) for arm, std in both)
-
-    @property
-    def fits_misfit(self) -> bool:
-        return all(arm.fitting.fits_misfit for arm in self.model.chains)
-
-    @property
-    def placed(self) -> tuple[str, ...]:
-        return self.model._of_arms(lambda arm: arm.fitting.placed)
-
-    @property
-    def slips(self) -> tuple[str, ...]:
-        return self.model._of_arms(lambda arm: arm.fitting.slips)
+    def __init__(self, model: Any) -> None:
+        super().__init__(model)
+        fits = [arm.fitting for arm in model.chains]
+        least = [float(model._scale(k).min()) for k in range(len(fits))]
+        self.misfit_std = max(
+            fit.misfit_std / std for fit, std in zip(fits, least, strict=True)
+        )
+        self.fits_misfit = all(fit.fits_misfit for fit in fits)
+        self.placed = model._of_arms(lambda arm: arm.fitting.placed)
+        self.slips = model._of_arms(lambda arm: arm.fitting.slips)
 
     def require_commands(self, commands: Array) -> None:
         for k, arm, _, arm_commands in self.model._parts(commands):

@@ -156,7 +156,7 @@ def test_intervals_hold_the_truth_and_predictions_err_as_stated(name, kind):
     if name == "plane":
         sensor = dataclasses.replace(sensor, places=_places(name, kind))
     real = arm.measured_with(sensor)
-    bent = real.with_misfit()
+    bent = real.fitting.misfit_model()
     noise, j = np.asarray(arm.default_noise().std), arm.num_joints
     judged = ~np.isin(arm.names, arm.default_prior().fixed)
     if name in ("plane", "board"):  # counted from where the first readings put them

@@ -15,7 +15,7 @@ from jaxcal.models import Pose, SerialChain, Socket
 from ..models.arms import CONTACTS, contacts_of_a_panda, ur5
 
 ARM = ur5()
-WHOLE = ARM.with_misfit()
+WHOLE = ARM.fitting.misfit_model()
 RNG = np.random.default_rng(0)
 JOINTS, ELSEWHERE = RNG.uniform(-120.0, 120.0, (2, 40, 6))
 STD = np.asarray(WHOLE.default_prior().std)
@@ -103,7 +103,7 @@ def _variance(arm, candidates, chosen, noise):
 def test_a_urdf_file_is_fitted_without_harmonics_and_says_what_that_costs(tmp_path):
     """The file is the arm that positions at the measured postures fit best."""
     arm = SerialChain.from_urdf(CONTACTS / "panda.urdf", tip="ball_link")
-    bent = arm.with_misfit()
+    bent = arm.fitting.misfit_model()
     joints = RNG.uniform(*np.clip(arm.limits, -60.0, 60.0).T, (60, 7))
     std = np.asarray(arm.default_prior().std)
     truth = arm.nominal + 0.3 * std * RNG.normal(size=len(std))
@@ -184,7 +184,7 @@ def test_contacts_of_eccentric_gears_err_elsewhere_as_predicted():
     arm = SerialChain.from_urdf(
         CONTACTS / "panda.urdf", tip="ball_link", sensor=Socket(1, [[0.45, 0.0, 0.3]])
     )
-    bent = arm.with_misfit()
+    bent = arm.fitting.misfit_model()
     waves = np.asarray(bent.default_prior().std)[-28:]
     there = arm.postures(40, seed=1)
     wide = arm.measured_with(Socket(1, [[0.2, 0.4, 0.6]])).postures(40, seed=2)

@@ -235,9 +235,9 @@ class Sensor(abc.ABC):
         """Where their own parameters are among the own parameters."""
         return (slice(0, len(self.names)),)
 
-    def with_members(self, members: Sequence[Sensor]) -> Sensor:
-        """This sensor, of others."""
-        return members[0]
+    def with_member(self, i: int, sensor: Sensor) -> Sensor:
+        """This sensor with another in the place of its member ``i``."""
+        return sensor
 
     def parts(self, inputs: Array) -> Iterator[tuple[int, Sensor, Rows, Array]]:
         """Each of them and its number, its rows, and its columns there."""

@@ -214,8 +214,9 @@ class Several(Sensor):
             first += len(one.names)
         return tuple(slices)
 
-    def with_members(self, members: Sequence[Sensor]) -> Self:
-        return dataclasses.replace(self, sensors=tuple(members))
+    def with_member(self, i: int, sensor: Sensor) -> Self:
+        sensors = (*self.sensors[:i], sensor, *self.sensors[i + 1 :])
+        return dataclasses.replace(self, sensors=sensors)
 
     def of_members(
         self, tip: Tip, inputs: Array, measured: Array | None
