@@ -383,7 +383,7 @@ class Arm:
         moved = np.zeros_like(axes)
         for (link, weight, centre), end in zip(self.loads, ends, strict=True):
             point = end[3] + np.einsum("k,kcn->cn", centre, end[:3])
-            motion = _cross(axes[:link], point - origins[:link])
+            motion = np.cross(axes[:link], point - origins[:link], axis=-2)
             slides = ~self._revolute[:link]
             motion[slides] = axes[:link][slides]
             moved[:link] += weight * motion
@@ -405,7 +405,7 @@ class Arm:
         at, joints = np.array(self.compliance)[:, None] - 1, np.arange(len(axes))
         first, second = np.minimum(at, joints), np.maximum(at, joints)
         axes[~self._revolute] = 0.0
-        across = _cross(np.array(self.gravity)[:, None], axes)
+        across = np.cross(np.array(self.gravity)[:, None], axes, axis=-2)
         rate = np.einsum("ijcn,ijcn->ijn", across[first], moved[second])
         rate[:, self._revolute] = np.radians(rate[:, self._revolute])
         return rate
@@ -429,13 +429,6 @@ def apparent_length(table: Array, tool: Array) -> tuple[float, int]:
     if plain <= _CANCELS * together:
         return plain, 0
     return together, 1 + int(np.abs(table[:, 2]).argmax())
-
-
-def _cross(left: Array, right: Array) -> Array:
-    """Cross products of (..., 3, N): over the axis before the last."""
-    x, y, z = (left[..., k, :] for k in range(3))
-    u, v, w = (right[..., k, :] for k in range(3))
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-2)
 
 
 def common(one: Arm, other: Arm) -> int:

@@ -307,11 +307,8 @@ def _error(arm: Chain, commands: Array, measured: Array) -> float:
         return np.inf
     off = measured - at.predict(commands)
     for part in at.readings(commands, off):
-        if part.sensor.num_places:  # its place is no merit of the arm
-            which = part.sensor.of_rows(part.columns)
-            for i in np.unique(which):
-                rows = part.rows[which == i]
-                off[rows] -= np.median(off[rows], axis=0)
+        for rows in filter(len, part.groups()):  # its place is no merit of the arm
+            off[rows] -= np.median(off[rows], axis=0)
     usual = np.asarray(at.default_noise().std)
     return float(np.median(np.linalg.norm(off / (usual / usual[0]), axis=1)))
 
@@ -336,8 +333,10 @@ def apart(arm: Chain, commands: Array, measured: Array) -> tuple[Array, Array] |
         return by_tip, by_view
     if not arm.sensor.positions:
         return None
-    gaps = [x[:, None] - x for x in (tip.position, measured[:, :3])]
-    return np.linalg.norm(gaps[0], axis=-1), np.linalg.norm(gaps[1], axis=-1)
+    by_tip, by_view = (
+        np.linalg.norm(x[:, None] - x, axis=-1) for x in (tip.position, measured[:, :3])
+    )
+    return by_tip, by_view
 
 
 def located(

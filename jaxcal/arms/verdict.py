@@ -277,8 +277,8 @@ def _nominal(fit: Fit, used: Rows, parts: list[Readings]) -> Array:
     predicted = model.located(commands, measured).predict(commands)
     off[used] = model.fitting.wrapped(measured - predicted, commands)
     for part in parts:  # a socket's place is no merit of either
-        for rows in part.groups():
-            off[rows] -= off[rows].mean(axis=0) if len(rows) else 0.0
+        for rows in filter(len, part.groups()):
+            off[rows] -= off[rows].mean(axis=0)
     return off
 
 

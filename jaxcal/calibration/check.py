@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
+from scipy.linalg import lapack
 
 from jaxcal.calibration.fit import Fit, columns_of, linearised, noise_of, outputs_at
 from jaxcal.calibration.pairing import of_new_readings
@@ -75,8 +77,7 @@ class Check:
         if self.unseen and not self.good:
             text += f"; a change could be hidden in {', '.join(self.unseen)}"
         if self.blind:
-            names = ", ".join(self.blind)
-            text += f"; not checked, because parts were moved: {names}"
+            text += f"; not checked, because parts were moved: {', '.join(self.blind)}"
         return (text,)
 
     @property
@@ -205,16 +206,12 @@ class LevelTests:
 
     def p_value(self, squares: Array) -> float:
         """Chance of sums (G,) of squared readings at least this large, unchanged."""
-        from scipy import special
-
         of_levels = special.fdtrc(self.counts, self.dof, squares / self.counts)
         return float(-np.expm1(len(self.counts) * special.log1p(-of_levels.min())))
 
     def power(self, shifts: Array) -> Array:
         """(...,) chance that changes with noncentralities (..., G) are seen. The
         squared estimate of a noise over the true variance is a chi-square / dof."""
-        from scipy import special
-
         alarms = -np.expm1(np.log1p(-self.alarms) / len(self.counts))  # of each level
         limit = special.fdtri(self.counts, self.dof, 1.0 - alarms) / self.least
         ratio = np.ones(1)
@@ -278,17 +275,13 @@ class ChangeTests:
 
     def power(self, shifts: Array, along: Array) -> Array:
         """(...,) at least, of noncentralities (..., G) in all, (...,) along a slip."""
-        whole = self.whole.power(shifts)
-        if not self.count:
-            return whole
-        return np.maximum(whole, self.slip.power(along[..., None]))
+        whole, slip = self.whole.power(shifts), along[..., None]
+        return np.maximum(whole, self.slip.power(slip)) if self.count else whole
 
     def smallest(self, seen: Array, along: Array) -> Array:
         """(p,) changes that are seen with the power asked for, by either."""
-        whole = self.whole.smallest(seen)
-        if not self.count:
-            return whole
-        return np.minimum(whole, self.slip.smallest(along[:, None]))
+        whole, slip = self.whole.smallest(seen), along[:, None]
+        return np.minimum(whole, self.slip.smallest(slip)) if self.count else whole
 
 
 class _Deviations(NamedTuple):
@@ -340,8 +333,6 @@ def _deviations(
 def _whitening(calibration: Fit, commands: Array, noise: Array) -> tuple[Array, float]:
     """(N m, N m) what whitens differences from predictions, for noise and their own
     uncertainty; the variance, of 1, without the misfit that they allow for."""
-    from scipy.linalg import lapack
-
     variances = np.tile(noise**2, len(commands))
     slopes, parameters = linearised(calibration, commands)
     slopes = slopes.reshape(len(variances), -1)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.calibration.resolution import COARSE, resolution
+from jaxcal.calibration.reasons import COARSE, resolution
 from jaxcal.calibration.warning import warn
 from jaxcal.checks import Array, Mask, array_of, numbers
 from jaxcal.information.singular import depends
@@ -68,7 +69,7 @@ class Fit:
             if isinstance(value, np.ndarray):
                 fields[name] = value = np.array(value)
                 value.flags.writeable = False
-        fields["provenance"] = _copied(self.provenance)
+        fields["provenance"] = json.loads(json.dumps(self.provenance))
 
     # -- parameters --------------------------------------------------------------------
 
@@ -406,15 +407,6 @@ def above_rounding(variance: Array, rows: Array, covariance: Array) -> Array:
     P) may cancel to zero or less: that is not known to be certain."""
     terms = (rows**2 * np.diag(covariance)).sum(axis=-1)
     return np.asarray(np.maximum(variance, np.finfo(np.float64).eps * terms))
-
-
-def _copied(content: Any) -> Any:
-    """A copy of what JSON can hold."""
-    if isinstance(content, str):
-        return content
-    if isinstance(content, Mapping):
-        return {key: _copied(value) for key, value in content.items()}
-    return [*map(_copied, content)] if isinstance(content, list) else content
 
 
 def say_far(

@@ -19,10 +19,10 @@ from jaxcal.calibration.reasons import (
     in_order,
     in_rows,
     never_measured,
+    resolution,
     saturated,
     short,
 )
-from jaxcal.calibration.resolution import resolution
 from jaxcal.checks import Array
 from jaxcal.late import late
 

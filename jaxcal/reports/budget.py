@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import special
 
 from jaxcal.calibration.fit import (
     Fit,
@@ -100,8 +101,6 @@ class Budget:
     @property
     def coverage_factor(self) -> Array:
         """(R,) Student's t of the effective degrees of freedom."""
-        from scipy import special
-
         upper, dof = 0.5 + 0.5 * self.confidence, self.dof
         known = np.isinf(dof)
         factor = special.stdtrit(np.where(known, 1.0, dof), upper)
@@ -282,11 +281,8 @@ def _parts(calibration: Fit, slopes: Array) -> dict[str, tuple[Array, float]]:
         undetermined = depends(slopes, unseen_directions(calibration)[:, :width])
         noise = np.where(undetermined, np.inf, noise)
     parts = {"noise": (noise, calibration.noise_dof or np.inf)}
-    if before.any():
-        parts["known before"] = before, np.inf
-    if misfit.any():
-        parts["misfit"] = misfit, np.inf
-    return parts
+    others = {"known before": before, "misfit": misfit}
+    return parts | {name: (part, np.inf) for name, part in others.items() if part.any()}
 
 
 def _gain(calibration: Fit, width: int) -> Array:
@@ -310,11 +306,9 @@ def _squares(calibration: Fit, source: Source, results: _Results, gain: Any) -> 
     """(R,) variances of the results by one source."""
     m, measured = calibration.num_outputs, calibration.measured
     moved = np.zeros(len(results.slopes))
-    kinds: list[tuple[str, Any, Any]] = [
-        ("offset", np.ones_like(measured), 1.0),
-        ("scale", measured, results.readings),
-    ]
-    for name, shape, scaled in kinds:
+    shapes = {"offset": (np.ones_like(measured), 1.0)}
+    shapes["scale"] = measured, results.readings
+    for name, (shape, scaled) in shapes.items():
         size = one_or_each(f"{name} of {source.name}", getattr(source, name), m)
         # Of each output by itself: (R, m).
         moves = results.slopes @ np.einsum("pnm,nm->pm", gain, shape * size)

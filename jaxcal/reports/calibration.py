@@ -99,17 +99,14 @@ def report(
     data["calibration.json"] = content.encode()
     hashes = {name: hashlib.sha256(of).hexdigest() for name, of in data.items()}
     document = _document(calibration, check) | {"files": hashes}
-    budgets: list[Budget] = []
+    budgets: dict[str, Budget] = {}
     if calibration.noise_std is not None:
-        budgets = [
-            budget(calibration, sources=sources),
-            _of_predictions(calibration, sources),
-        ]
-        document["budget"] = budgets[0].to_dict()
-        document["budget_of_predictions"] = budgets[1].to_dict()
+        budgets["budget"] = budget(calibration, sources=sources)
+        budgets["budget_of_predictions"] = _of_predictions(calibration, sources)
+        document |= {key: table.to_dict() for key, table in budgets.items()}
     if before is not None:
         document["moved"] = moved(calibration, before)
-    page = _page_of(calibration, document, budgets, readings)
+    page = _page_of(calibration, document, [*budgets.values()], readings)
     written = {
         "calibration.json": content,
         "verdict.json": json.dumps(document, indent=1, allow_nan=False) + "\n",
@@ -147,11 +144,10 @@ def _of_predictions(calibration: Fit, sources: Sequence[Source]) -> Budget:
     off = (commands - commands.mean(axis=0)) / np.where(spread > 0.0, spread, 1.0)
     std = calibration.predict_std(commands) / noise_of(calibration, "budget")
     rows = [int((off**2).sum(axis=1).argmin()), int((std**2).sum(axis=1).argmax())]
-    names = [
-        f"{output} at {row}" for row in rows for output in calibration.output_names
-    ]
+    outputs = calibration.output_names
+    names = tuple(f"{output} at {row}" for row in rows for output in outputs)
     of_rows = budget(calibration, commands[rows], sources=sources)
-    return dataclasses.replace(of_rows, names=tuple(names))
+    return dataclasses.replace(of_rows, names=names)
 
 
 def _numbers(calibration: Calibration, check: Check | None) -> dict[str, Any]:
@@ -162,19 +158,13 @@ def _numbers(calibration: Calibration, check: Check | None) -> dict[str, Any]:
         "lack_of_fit_p": calibration.lack_of_fit(),
     }
     held_out = None if calibration.noise_std is None else left_out(calibration)
-    errors = {
-        "residual_rms": calibration.residuals,
-        "held_out_mean": held_out,
-        "nominal_mean": nominal_errors(calibration),
-    }
-    for name, off in errors.items():
-        if off is None:
-            continue
-        for in_unit, quantity in named(calibration, name):
-            size = quantity.size(off).mean()
-            if name == "residual_rms":
-                size = np.sqrt(np.mean(off[:, quantity.columns] ** 2))
-            numbers[in_unit] = float(size)
+    off = calibration.residuals
+    for name, quantity in named(calibration, "residual_rms"):
+        numbers[name] = float(np.sqrt(np.mean(off[:, quantity.columns] ** 2)))
+    errors = {"held_out_mean": held_out, "nominal_mean": nominal_errors(calibration)}
+    for kind, of_rows in errors.items():
+        for name, quantity in named(calibration, kind) if of_rows is not None else ():
+            numbers[name] = float(quantity.size(of_rows).mean())
     if check is not None:
         numbers["check_says"] = check.says
         numbers |= {"check_p": check.p_value, "check_power": check.power}
@@ -269,9 +259,8 @@ def _new_section(
 ) -> pages.Section:
     commands = as_points(calibration, "commands", commands, calibration.num_inputs)
     off = as_points(calibration, "measured", measured, calibration.num_outputs)
-    off = calibration.model.fitting.wrapped(
-        off - outputs_at(calibration, commands), commands
-    )
+    off = off - outputs_at(calibration, commands)
+    off = calibration.model.fitting.wrapped(off, commands)
     std = calibration.predict_std(commands, new_measurement=True)
     kinds = ("off", "off in standard deviations")
     head = [f"{name} {kind}" for kind in kinds for name in calibration.output_names]
@@ -299,9 +288,8 @@ def _moved_section(
     calibration: Fit, rows: Sequence[Mapping[str, Any]]
 ) -> pages.Section:
     units = dict(zip(calibration.names, _units(calibration), strict=False))
-    ordered = sorted(rows, key=lambda row: -abs(row["deviations"] or 0.0))
     cells = []
-    for row in ordered:
+    for row in sorted(rows, key=lambda row: -abs(row["deviations"] or 0.0)):
         times = row["deviations"]
         shown = "-" if times is None else f"{times:+.2f}"
         values = (f"{row[key]:.6g}" for key in ("before", "after", "difference"))
@@ -327,7 +315,7 @@ def _residual_section(calibration: Calibration) -> pages.Section:
     if calibration.noise_std is not None:
         kinds = {"leverage": leverage(calibration), "held-out": left_out(calibration)}
         head += [f"{kind} {name}" for kind in kinds for name in names]
-        columns += [column for table in kinds.values() for column in table.T]
+        columns += [*np.hstack([*kinds.values()]).T]
     return pages.Section("Residuals", [figure, _by_row(head, columns)], "residuals")
 
 
@@ -340,14 +328,9 @@ def _files_section(calibration: Fit, files: Mapping[str, str]) -> pages.Section:
     kind = type(calibration.model).__name__
     packages = calibration.provenance.get("packages", {})
     made = ", ".join(f"{name} {version}" for name, version in packages.items())
-    return pages.Section(
-        "Model and files",
-        [
-            f"Model {kind}, {calibration.loss} loss. {made}",
-            pages.Table(("file", "SHA-256"), rows, numeric=False),
-        ],
-        "files",
-    )
+    text = f"Model {kind}, {calibration.loss} loss. {made}"
+    table = pages.Table(("file", "SHA-256"), rows, numeric=False)
+    return pages.Section("Model and files", [text, table], "files")
 
 
 def _scatter(

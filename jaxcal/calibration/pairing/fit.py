@@ -438,9 +438,8 @@ def benign_fits(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
     """The table as it is, with what machines do: drift, curves, another machine."""
     count = len(table.commands)
     time = np.linspace(-1.0, 1.0, count)[:, None]
-    extras = [time, np.hstack([time, time**2])]
-    for column in table.commands.T:  # approached from one side
-        extras.append(np.sign(np.gradient(column))[:, None])
+    extras = [time, np.hstack([time, time**2])]  # approached from one side, too
+    extras += [np.sign(np.gradient(column))[:, None] for column in table.commands.T]
     commands = table.commands - table.commands.mean(axis=0)
     commands = commands / (commands.std(axis=0) + 1e-300)
     n = commands.shape[1]
@@ -452,13 +451,11 @@ def benign_fits(table: Table, plain: Fitted, best: Fitted) -> list[Fitted]:
     terms = [squares, cubes, np.hstack([cubes, time])]
     if best.hypothesis.kind in SESSIONS:  # a drift that turns
         terms.append(np.cos(0.5 * np.pi * (time + 1.0) * np.arange(1, _WAVES)))
-    for more in terms:
-        if more.shape[1] + n + 1 < count // 2:
-            extras.append(more)
+    extras += [more for more in terms if more.shape[1] + n + 1 < count // 2]
     if best.hypothesis.kind in SESSIONS:
-        for column in commands.T:
-            for knot in np.quantile(column, np.linspace(0.1, 0.9, 9)):
-                extras.append(np.maximum(column - knot, 0.0)[:, None])
+        knots = np.quantile(commands, np.linspace(0.1, 0.9, 9), axis=0)
+        bent = np.maximum(commands - knots[:, None], 0.0)  # (9, N, n)
+        extras += [*bent.transpose(2, 0, 1).reshape(-1, count, 1)]
     at = dataclasses.replace(table, theta=plain.theta)
     if not table.free.any():  # a machine that changed since it was calibrated
         ones = np.ones((count, 1))

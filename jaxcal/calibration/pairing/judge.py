@@ -31,8 +31,7 @@ from jaxcal.calibration.pairing.fit import (
     path_match,
     top,
 )
-from jaxcal.calibration.reasons import froze, in_rows
-from jaxcal.calibration.resolution import COARSE, resolution
+from jaxcal.calibration.reasons import COARSE, froze, in_rows, resolution
 from jaxcal.checks import Array, in_words
 from jaxcal.models.model import Model, Rows
 from jaxcal.models.uncertainty import Prior
@@ -105,11 +104,11 @@ class Mispairing:
         paired, readings = commands[self.match[rows]], measured[rows]
         if self.sensed is not None:
             paired[:, self.sensed] = commands[rows, self.sensed]
-        if self.change is None:
-            return paired, readings
-        if self.change.of_readings:
-            return paired, self.change(readings)
-        return self.change(paired), readings
+        if self.change is not None and self.change.of_readings:
+            readings = self.change(readings)
+        elif self.change is not None:
+            paired = self.change(paired)
+        return paired, readings
 
 
 def mispairing(fit: Fit) -> Mispairing | None:
@@ -169,9 +168,8 @@ def of_new_readings(fit: Fit, commands: Array, measured: Array) -> Mispairing | 
     if table is None:
         return None
     noise = np.asarray(noise_of(fit, "check"))
-    table = dataclasses.replace(
-        table, scale=noise, width=table.width * table.scale / noise
-    )
+    width = table.width * table.scale / noise
+    table = dataclasses.replace(table, scale=noise, width=width)
     names = fit.input_names, fit.output_names
     return _found(table, *names, fit.measured_unit) or _rows_off(table)
 
@@ -202,10 +200,8 @@ def of_fit(fit: Fit) -> Table | None:
     if fit.noise_std is not None:  # what a display rounded, it read within a step
         step = resolution(measured, COARSE)
         step[fit.noise_std >= step] = 0.0
-        if step.any():
-            measured += step * np.random.default_rng(0).uniform(
-                -0.5, 0.5, measured.shape
-            )
+        within = np.random.default_rng(0).uniform(-0.5, 0.5, measured.shape)
+        measured += step * within
     counted = fit.loss_weights > 0.0
     table = _table(fit.model, fit.commands, measured, prior, counted)
     return table and dataclasses.replace(table, theta=np.asarray(fit.parameters))
@@ -409,19 +405,17 @@ def _as_good(table: Table, best: Fitted, fits: list[Fitted]) -> list[Fitted]:
     noise = np.maximum(best.noise, 1e-300)
     row = float((2.0 + np.log(table.width / noise).clip(0.0)).sum())
     paired = best.hypothesis.match >= 0
-    as_good = []
-    for fit in top(fits, len(fits)):
+    kind, change = best.hypothesis.kind, best.hypothesis.change
+
+    def rivals(fit: Fitted) -> bool:
         other, fewer = fit.hypothesis, 0
-        foreign = any(by == FOREIGN for _, by in other.starts)
-        if other.kind in _FREQUENT and not foreign:
+        if other.kind in _FREQUENT and all(by != FOREIGN for _, by in other.starts):
             fewer = int((paired & (other.match < 0)).sum())
         near = fit.evidence > best.evidence - _AS_GOOD - fewer * row
-        kind = best.hypothesis.kind, best.hypothesis.change
-        same = kind == (other.kind, other.change)
-        same |= {kind[0], other.kind} <= SESSIONS
-        if near and not same:
-            as_good.append(fit)
-    return as_good
+        same = (kind, change) == (other.kind, other.change)
+        return near and not same and not {kind, other.kind} <= SESSIONS
+
+    return [*filter(rivals, top(fits, len(fits)))]
 
 
 def _plainly_right(fit: Fit) -> bool:

@@ -8,6 +8,7 @@ import itertools
 import math
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from jaxcal.calibration.pairing.fit import (
     MOST_ROWS,
@@ -81,11 +82,8 @@ def changed_columns(
             if anew is not None:
                 tables.append((_left_over(anew, hypothesis, every), anew, hypothesis))
     tables.sort(key=lambda row: row[0])
-    return [
-        fit
-        for _, anew, hypothesis in tables[:_COLUMNS]
-        for fit in fits_of(anew, [hypothesis])
-    ]
+    few = tables[:_COLUMNS]
+    return [fit for _, anew, kind in few for fit in fits_of(anew, [kind])]
 
 
 def by_nominal(table: Table, inputs: Names, outputs: Names) -> Fitted | None:
@@ -103,13 +101,11 @@ def by_nominal(table: Table, inputs: Names, outputs: Names) -> Fitted | None:
     if not kinds:
         return None
     shares = np.array([_unexplained(table, x, rows, said) for x in kinds])
-    order = np.argsort(shares.sum(axis=1), kind="stable")
-    best = int(order[0])
+    best, *others = np.argsort(shares.sum(axis=1), kind="stable").tolist()
     change = kinds[best].change
-    if change and change.estimated and len(order) > 1:  # unless a unit is as good
-        unit = int(order[1])
+    for unit in others[:1] if change and change.estimated else ():
         if (shares[unit] <= 4.0 * shares[best] + _AS_GOOD_SHARE).all():
-            best = unit
+            best = unit  # which is as good as a number
     if (shares[best] >= _LEFT_OVER).any():
         return None
     nominal = dataclasses.replace(table, theta=table.mean)
@@ -156,10 +152,11 @@ def _kinds_of_columns(
     for names, count, of_readings in tables:
         kinds: list[tuple[str, list[int], float]] = []  # words, columns and factor
         singly = range(count if count <= _MOST else 0)  # no trajectory's readings
-        for i in singly:
-            for what, factor in ways.items():
-                kinds.append((f"{names[i]} {what}", [i], factor))
-        side = "the readings" if of_readings else "the commands"
+        kinds += [
+            (f"{names[i]} {what}", [i], factor)
+            for i in singly
+            for what, factor in ways.items()
+        ]
         together = ways if count > 1 else {}
         if theta is not None and read and moved and not of_readings:
             most = np.ptp(table.commands[:, :moved], axis=0).max()
@@ -169,9 +166,9 @@ def _kinds_of_columns(
                 for count in _COUNTS
                 if most > _TURNED * count
             }
+        every = f"every column of the {'readings' if of_readings else 'commands'}"
         for what, factor in together.items():
-            every = f"every column of {side} {what}"
-            kinds.append((every, [*range(count)], factor))
+            kinds.append((f"{every} {what}", [*range(count)], factor))
         for i, j in itertools.combinations(singly, 2):
             both = f"{names[i]} and {names[j]}"
             kinds.append((f"{both} are exchanged", [i, j], 1.0))
@@ -199,15 +196,13 @@ def _kinds_of_columns(
         words = f"the readings are {times:.3g} times what the parameters say (counts?)"
         places = tuple(range(len(outputs))), (1.0 / times,) * len(outputs)
         changes.append(ColumnChange(words, True, *places, estimated=True))
-    code, several = _KINDS + np.log(len(changes) + 1.0), np.log(20.0)
-    rows = np.arange(len(table.commands))
-    costs = [
-        several * (" and " in x.words) + _KINDS * ("every" in x.words) for x in changes
-    ]
-    return [
-        Hypothesis("columns", rows, code + cost, change=x)
-        for x, cost in zip(changes, costs, strict=True)
-    ]
+    code, rows = _KINDS + np.log(len(changes) + 1.0), np.arange(len(table.commands))
+
+    def cost(words: str) -> float:
+        several = np.log(20.0) * (" and " in words)
+        return float(code + (several + _KINDS * ("every" in words)))
+
+    return [Hypothesis("columns", rows, cost(x.words), change=x) for x in changes]
 
 
 def _multiple(table: Table, theta: Array) -> float:
@@ -296,9 +291,8 @@ def places(table: Table) -> list[Table]:
     matches = [shifted(count, by) for by in (1, -1, 2, -2, 3, -3)]
     matches += [every[::-1], (every + half) % count, (every - half) % count]
     matches += [] if table.alike is None else [table.alike]
-    windows += [(match, every) for match in matches]
     ranked = []
-    for match, rows in windows:
+    for match, rows in [*windows, *((match, every) for match in matches)]:
         hypothesis = Hypothesis("", match)
         rows = rows[(match[rows] >= 0) & table.counted[rows]]
         anew = _anew(table, hypothesis, rows)
@@ -337,12 +331,9 @@ def polished(fit: Fitted) -> tuple[Fitted, dict[int, list[int]]]:
             path[i] = (low + best, path[i][1])
         if tuple(path) == fit.hypothesis.starts:
             break
-        match = path_match(count, path)
-        fit = fitted(
-            table,
-            dataclasses.replace(fit.hypothesis, match=match, starts=tuple(path)),
-            fit.theta,
-        )
+        changed = {"match": path_match(count, path), "starts": tuple(path)}
+        hypothesis = dataclasses.replace(fit.hypothesis, **changed)
+        fit = fitted(table, hypothesis, fit.theta)
         noise = np.maximum(fit.noise, 1e-7)
     return fit, near
 
@@ -358,8 +349,6 @@ def _off(fit: Fitted, match: Rows, rows: Rows) -> Array:
 
 def assigned(fit: Fitted, rows: Rows) -> Rows:
     """(N,) match in which readings of ``rows`` have those commands that fit best."""
-    from scipy.optimize import linear_sum_assignment
-
     table, match = fit.table, fit.hypothesis.match.copy()
     commands = match[rows]
     noise = np.maximum(fit.noise, 1e-7)
@@ -409,10 +398,10 @@ def sorted_alone(table: Table, plain: Fitted) -> list[Fitted]:
         kinds.append(("readings sorted", 5.0 * np.log(count)))
     if not kinds:
         return []
-    fits = [] if table.alike is None else [_matched(table, table.alike)]
+    matches = [] if table.alike is None else [table.alike]
     if not table.sensed:
-        expected = dataclasses.replace(table, theta=table.mean)
-        fits += [_matched(table, match) for match in matched_anew(expected, plain)]
+        matches += matched_anew(dataclasses.replace(table, theta=table.mean), plain)
+    fits = [_matched(table, match) for match in matches]
     return [
         fit._replace(
             hypothesis=dataclasses.replace(fit.hypothesis, kind=kind, code=code),
@@ -440,8 +429,6 @@ def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
     """Matches (N,) by which readings that lost their order fit some parameters best.
     One output alone is matched by sorting, for many parameters at once, in turn with
     least squares; the best matches are refined with all outputs by assignment."""
-    from scipy.optimize import linear_sum_assignment
-
     every = np.arange(len(table.commands))
     if not table.free.any():
         return [assigned(fit, every)]
@@ -469,8 +456,7 @@ def matched_anew(table: Table, fit: Fitted) -> list[Rows]:
             tried[match.tobytes()] = square, match
             if square < _SOLVED * all_of_it:
                 return [match]
-    best = sorted(tried.values(), key=lambda pair: pair[0])[:2]
-    return [match for _, match in best]
+    return [match for _, match in sorted(tried.values(), key=lambda x: x[0])[:2]]
 
 
 def _sorted_matches(factors: Array, fixed: Array, read: Array) -> Rows:
@@ -495,6 +481,5 @@ def _sorted_matches(factors: Array, fixed: Array, read: Array) -> Rows:
     _, first = np.unique(ranks, axis=0, return_index=True)
     best = ranks[np.sort(first)[:_REFINED]]
     matches = np.empty_like(best)  # of the reading of a rank, its command
-    by_rank = np.argsort(best, axis=1)
-    matches[:, np.argsort(read, kind="stable")] = by_rank
+    matches[:, np.argsort(read, kind="stable")] = np.argsort(best, axis=1)
     return matches

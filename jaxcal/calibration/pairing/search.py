@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxcal.calibration.pairing.fit import (
     FOREIGN,
+    SESSIONS,
     Fitted,
     Hypothesis,
     Path,
@@ -246,11 +247,9 @@ def _steps(systems: _Systems) -> list[tuple[float, Hypothesis]]:
     table, count = systems.table, len(systems.table.commands)
     scored: list[tuple[float, Hypothesis]] = []
     path: Path
-    after = np.arange(count)
+    after, ones = np.arange(count), np.ones((count, 1))
     code = _KINDS + np.log(count)
-    slopes, right, _ = systems.of(after[None])
-    slopes, right = slopes[0], right[0]
-    ones = np.ones((count, 1))
+    slopes, right, _ = (part[0] for part in systems.of(after[None]))
     kinds = [("offset", ones, _LEAST)]
     if table.shared:
         kinds.append(("parameters", slopes[:, 0], slopes.shape[-1] + 2))
@@ -320,26 +319,20 @@ def what_is_wrong(
     kind, starts = hypothesis.kind, hypothesis.starts
     if hypothesis.change is not None:
         return hypothesis.change.words
-    if kind == "shift":
-        return f"all readings are {_rows_late(starts[0][1])}"
     if kind in _WHOLE:
         return _WHOLE[kind]
+    by = starts[0][1] if starts else 0
+    if kind == "shift":
+        return f"all readings are {_rows_late(by)}"
+    of_first = f"the readings from row {-by % count} on belong to the first commands"
     if kind == "halves":
-        return (
-            "the halves of the readings are exchanged: the readings from row "
-            f"{-starts[0][1] % count} on belong to the first commands"
-        )
-    if kind == "rotation" and abs(starts[0][1]) <= count // 3:
-        last, far = "first" if starts[0][1] > 0 else "last", abs(starts[0][1])
-        these = f"{last} {far} are" if far > 1 else f"{last} is"
-        return (
-            f"all readings are {_rows_late(starts[0][1])}; the {these} at the other end"
-        )
+        return f"the halves of the readings are exchanged: {of_first}"
+    if kind == "rotation" and abs(by) <= count // 3:
+        end = "first" if by > 0 else "last"
+        these = f"{end} {abs(by)} are" if abs(by) > 1 else f"{end} is"
+        return f"all readings are {_rows_late(by)}; the {these} at the other end"
     if kind == "rotation":
-        return (
-            f"the readings from row {-starts[0][1] % count} on belong to the first "
-            "commands, the readings before it to the last"
-        )
+        return f"{of_first}, the readings before it to the last"
     if kind == "exchanged":
         rows = np.flatnonzero(hypothesis.match != np.arange(count))
         return f"the readings of rows {', '.join(map(str, rows))} are exchanged"
@@ -348,14 +341,12 @@ def what_is_wrong(
             f"the table seems to join three sessions: from row {starts[1][0]} on and "
             f"from row {starts[2][0]} on the readings have another offset"
         )
-    if kind in ("offset", "parameters"):
+    if kind in SESSIONS:
         another = "slope or offset"
         if kind == "offset":
-            steps = (
-                fit.solution[-1] if table.shared else fit.solution[-table.outputs :, 0]
-            )
-            size = f"{in_words(steps * table.scale)} {unit}".strip()
-            another = f"offset, by {size}"
+            step = fit.solution[-1]
+            step = step if table.shared else fit.solution[-table.outputs :, 0]
+            another = f"offset, by {in_words(step * table.scale)} {unit}".strip()
         return (
             f"the table seems to join two sessions: from row {starts[1][0]} on the "
             f"readings have another {another}"
@@ -371,20 +362,15 @@ def _rows_late(by: int) -> str:
 
 def _path_words(path: Path, near: dict[int, list[int]], count: int) -> str:
     parts = []
-    for i, (start, by) in enumerate(path):
+    ends = [*(start for start, _ in path[1:]), count]
+    for i, ((start, by), end) in enumerate(zip(path, ends, strict=True)):
         if by == 0:
             continue
-        end = path[i + 1][0] if i + 1 < len(path) else count
-        where = (
-            f"from row {start} on" if end == count else f"from row {start} to {end - 1}"
-        )
-        if start == 0:
-            where = f"up to row {end - 1}"
-        rows = near.get(i, [])
-        if len(rows) > 1:
+        where = f"from row {start} " + ("on" if end == count else f"to {end - 1}")
+        where = where if start else f"up to row {end - 1}"
+        if len(rows := near.get(i, [])) > 1:
             where += f" (or any from {rows[0]} to {rows[-1]})"
-        if by == FOREIGN:
-            parts.append(f"{where}, readings do not belong to these commands")
-        else:
-            parts.append(f"{where}, readings are {_rows_late(by)}")
+        foreign = "do not belong to these commands"
+        what = foreign if by == FOREIGN else f"are {_rows_late(by)}"
+        parts.append(f"{where}, readings {what}")
     return "; ".join(parts)
