@@ -7,6 +7,7 @@ for, and said.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -115,12 +116,10 @@ def improved(model: Chain, fit: Fit) -> Fit:
         return fit
     before, trials = _held_out(fit), {}
     for words, other, prior in _alternatives(model):
-        try:
+        with contextlib.suppress(ValueError):  # it does not converge
             trial = fitted_again(fit, other, prior)
             if trial.noise_std is not None:
                 trials[words] = trial, _held_out(trial)
-        except ValueError:  # it does not converge
-            continue
     if not trials:
         return fit
     best = min((off for _, off in trials.values()), key=np.mean)
@@ -222,11 +221,8 @@ def play_in_words(fit: Fit) -> list[str]:
     sure = np.abs(play) > _SURE * np.sqrt(inverse.diagonal())
     if left > _PLAY or not sure.any():
         return []
-    names = np.array(model.names)[at][seen][sure]
-    sizes = ", ".join(
-        f"{name} {2.0 * abs(half):.2g} deg"
-        for name, half in zip(names, play[sure], strict=True)
-    )
+    both = zip(np.array(model.names)[at][seen][sure], play[sure], strict=True)
+    sizes = ", ".join(f"{name} {2.0 * abs(half):.2g} deg" for name, half in both)
     return [
         f"Residuals depend on the side from which joints came (backlash: {sizes}). "
         "Approaching always from one side would reduce the scatter by "
@@ -264,10 +260,8 @@ def unexplained(model: Chain, fit: Fit, rows: Array) -> Array:
     columns, used = fit.model.num_joints, fit.loss_weights > 0.0
     measured = fit.commands[used, :columns]
     low, high = measured.min(axis=0), measured.max(axis=0)
-    least = np.where(
-        np.array(model.command_units) == "deg", _NARROW, _SHORT * model.length
-    )
-    width = np.maximum(high - low, least)
+    turning = np.array(model.command_units) == "deg"
+    width = np.maximum(high - low, np.where(turning, _NARROW, _SHORT * model.length))
     joints = rows[:, :columns]
     beyond = np.maximum(low - joints, joints - high).clip(0.0) / width
     times = 1.0 + (_BEYOND * np.linalg.norm(beyond, axis=1)) ** 2

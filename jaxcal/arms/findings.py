@@ -77,30 +77,26 @@ def findings_of(
     seen already; ``more`` measurements may help.
     """
     model = fit.model
-    swapped: dict[int, int] = {}
-    for part in parts:
-        swapped |= _swapped(fit, part, scatter is None)
+    of_parts = [_swapped(fit, part, scatter is None) for part in parts]
+    swapped = {row: other for rows in of_parts for row, other in rows.items()}
     exchanged = [line for part in parts for line in _exchanged(fit, part)]
     limit = _LOOSE if len(used) > _SPARSE else 0.0
     usual = np.asarray(model.default_noise().std)  # of the sensor, or as was said
     of_noise = scatter is not None and fit.noise_known  # all rows are far off
     outliers = [] if of_noise else [*fit.outliers]
-    contradicting: list[int] = []
-    reasons = _wrong_rows(fit, used, parts, swapped, outliers)
-    if scatter:
-        reasons.insert(0, scatter.fact)
     far = fit.distance[outliers] > limit**2
     far &= (np.abs(fit.residuals[outliers]) > limit * usual).any(axis=1)
-    if swapped or exchanged or far.any():
-        reasons.insert(0, "some readings contradict the others")
-        contradicting = sorted({*swapped, *outliers})
+    contradict = bool(swapped or exchanged or far.any())
+    contradicting = sorted({*swapped, *outliers}) if contradict else []
+    reasons = ["some readings contradict the others"] * contradict
+    reasons += [scatter.fact] if scatter else []
+    reasons += _wrong_rows(fit, used, parts, swapped, outliers)
     moved = {part.kind: _moved(fit, part, swapped) for part in parts}
     kind = next((kind for kind, lines in moved.items() if lines), "")
     tip, doubtful = _other_tip(fit, model)
     other_arm = [] if mistaken else _other_links(fit, parts)
-    apart, wrong = (
-        ([], False) if other_arm else other_distances(fit, parts, model.length)
-    )
+    judged = [] if other_arm else parts
+    apart, wrong = other_distances(fit, judged, model.length)
     still, unused = _still(model, fit.commands[used])
     reasons += [line for lines in moved.values() for line in lines]
     reasons += exchanged + _far(fit) + tip + other_arm + apart + still + _kept(fit)
@@ -188,24 +184,23 @@ def _wrong_rows(
 
 def _far(fit: Fit) -> list[str]:
     """Parameters that were found far from what was known of them."""
-    names = fit.names
-    p = len(names)
+    p = len(fit.names)
     off = np.abs(fit.parameters - fit.prior_mean[:p])
     off = off * np.sqrt(fit.prior_precision[:p]) * fit.free[:p]
     return [
-        f"{names[i]} is {off[i]:.2g} standard deviations from its prior: is the tip, "
-        "file or unit wrong?"
+        f"{fit.names[i]} is {off[i]:.2g} standard deviations from its prior: is the "
+        "tip, file or unit wrong?"
         for i in np.flatnonzero(off > _FAR)
     ]
 
 
 def _kept(fit: Fit) -> list[str]:
     """Shifts of the tool that contacts do not show."""
-    sensor, names = fit.model.sensor.members[0], fit.names
+    sensor = fit.model.sensor.members[0]
     if not sensor.zeros or sensor.views:
         return []
-    shown = dict(zip(names, np.asarray(fit.from_data), strict=True))
-    kept = [name for name in names if name[:-1] == "tool " and shown[name] < _SHOWN]
+    shares = zip(fit.names, np.asarray(fit.from_data), strict=True)
+    kept = [name for name, x in shares if name[:-1] == "tool " and x < _SHOWN]
     if not kept:
         return []
     return [
@@ -217,10 +212,9 @@ def _kept(fit: Fit) -> list[str]:
 def _other_tip(fit: Fit, model: Chain) -> tuple[list[str], bool]:
     """A tip far from where the arm's description has it, and whether that is in doubt:
     it is farther off than the prior allowed."""
-    if not model.sensor.members[0].zeros:  # the others' places on the tool are loose
-        return [], False
     names = fit.names
-    if "tool rx" in names:  # where a camera or board is on the tip is asked for
+    # Others' places on the tool are loose; those of a camera or board are asked for.
+    if not model.sensor.members[0].zeros or "tool rx" in names:
         return [], False
     at = [names.index(f"tool {axis}") for axis in "xyz" if f"tool {axis}" in names]
     moved = fit.parameters[at] - model.nominal[at]
@@ -256,9 +250,7 @@ def other_distances(
         change = np.array(distances)[:, 3] * np.abs(off) / (1.0 - share)
         doubtful = np.abs(off) > _APART * np.sqrt(1.0 - share)
         doubtful &= (share < 1.0 - _ALONE) & (change > _SHORT * length)
-        doubtful &= part.touched()
-        if part.judged is not None:
-            doubtful &= ~part.judged
+        doubtful &= part.touched() & ~part.judged
         for k in np.flatnonzero(doubtful).tolist():
             first, second, distance, std = distances[k]
             free, free_std = _freed(fit, part, k)
@@ -302,12 +294,10 @@ def _at_these_sizes(fit: Fit, facts: Array) -> Array:
     rows = weight * slopes / np.asarray(fit.noise_std)[:, None]
     rows = np.vstack([rows.reshape(-1, len(theta)), facts])
     free = np.flatnonzero(fit.free[: len(theta)])
-    precision = fit.prior_precision[free]
-    information = rows[:, free].T @ rows[:, free] + np.diag(precision)
+    information = rows[:, free].T @ rows[:, free] + np.diag(fit.prior_precision[free])
     scale = 1.0 / np.sqrt(information.diagonal() + 1e-300)
-    inverse = np.linalg.pinv(
-        scale[:, None] * information * scale, 1e-13, hermitian=True
-    )
+    scaled = scale[:, None] * information * scale
+    inverse = np.linalg.pinv(scaled, 1e-13, hermitian=True)
     covariance = np.zeros((len(theta), len(theta)))
     covariance[np.ix_(free, free)] = scale[:, None] * inverse * scale
     return covariance

@@ -42,10 +42,9 @@ _OTHER_UNIT = 0.01  # of it: so far off and tenfold, a distance is in another un
 
 def require_readings(arm: Chain, commands: Array, measured: Array | None) -> None:
     """Refuse what no arm like this one takes or gives; None, candidates."""
-    if measured is not None:
-        for part in arm.readings(commands, measured):
-            if len(part.rows):
-                _require_part(part, commands[part.rows, : arm.num_joints])
+    for part in () if measured is None else arm.readings(commands, measured):
+        if len(part.rows):
+            _require_part(part, commands[part.rows, : arm.num_joints])
     arm.fitting.require_commands(commands)
     turning = np.array(arm.command_units) == "deg"
     largest = np.abs(commands[:, : arm.num_joints][:, turning]).max(initial=0.0)
@@ -185,9 +184,9 @@ def _require_in_picture(board: Board, pixels: Array, length: float) -> None:
 def _warn_of_picture(arm: Chain, candidates: Array) -> None:
     """Warn of candidates from which a camera does not have the whole board in view."""
     board = arm.sensor
-    if not isinstance(board, Board) or board.corners is None:
+    if not isinstance(board, Board) or board.picture is None:
         return
-    if board.picture is None or board.place is None:
+    if board.corners is None or board.place is None:
         return
     _, place, turn = seen_by(arm, candidates)
     depth = turn[:, 2] @ board.outline.T + place[:, 2:]
@@ -366,25 +365,24 @@ def _base_of(arm: Chain, commands: Array, measured: Array | None) -> Array:
     """(4, 4) where its first tracker sees the arm if far off, else the base."""
     if measured is None:
         return arm.base
-    for part in arm.readings(commands, measured):
-        if not part.sensor.positions or not len(part.rows):
-            continue
-        reached = np.asarray(part.measured)[:, :3]
-        moved = _far(part.tip.position, reached, arm.length)
-        if (moved == np.eye(4)).all():
-            return arm.base
-        base = moved @ arm.base
-        if not part.sensor.relative:
-            return base
-        shift = np.linalg.norm((base - arm.base)[:3, 3])
-        turned = np.trace(moved[:3, :3]) < 1.0 + 2.0 * _ASIDE
-        if turned or shift > _AWAY * arm.length:
-            raise ValueError(
-                "base is missing: with Pose, turns are relative to the nominal ones, "
-                f"so give base roughly. The positions fit base={base.round(7).tolist()}"
-                "; then compute the turns with its rotation_vectors"
-            )
-        break
+    parts = arm.readings(commands, measured)
+    part = next((x for x in parts if x.sensor.positions and len(x.rows)), None)
+    if part is None:
+        return arm.base
+    moved = _far(part.tip.position, np.asarray(part.measured)[:, :3], arm.length)
+    if moved is None:
+        return arm.base
+    base = moved @ arm.base
+    if not part.sensor.relative:
+        return base
+    shift = np.linalg.norm((base - arm.base)[:3, 3])
+    turned = np.trace(moved[:3, :3]) < 1.0 + 2.0 * _ASIDE
+    if turned or shift > _AWAY * arm.length:
+        raise ValueError(
+            "base is missing: with Pose, turns are relative to the nominal ones, "
+            f"so give base roughly. The positions fit base={base.round(7).tolist()}"
+            "; then compute the turns with its rotation_vectors"
+        )
     return arm.base
 
 
@@ -392,17 +390,17 @@ def _standing_at(arm: Chain, base: Array) -> Chain:
     return arm if base is arm.base else dataclasses.replace(arm, base=base)
 
 
-def _far(points: Array, measured: Array, length: float) -> Array:
+def _far(points: Array, measured: Array, length: float) -> Array | None:
     """(4, 4) that takes nominal points (N, 3) to those measured, if those are far off
-    and it explains them; else one."""
+    and it explains them; else None."""
     moved, off = np.eye(4), np.linalg.norm(measured - points, axis=1)
     if len(points) < 4 or np.median(off) < _NEAR * length:
-        return moved
+        return None
     middle, there = points.mean(axis=0), measured.mean(axis=0)
     turn = Rotation.align_vectors(measured - there, points - middle)[0].as_matrix()
     moved[:3, :3], moved[:3, 3] = turn, there - turn @ middle
     errors = np.linalg.norm(points @ turn.T + moved[:3, 3] - measured, axis=1)
-    return moved if np.median(errors) < _ALIKE * length else np.eye(4)
+    return moved if np.median(errors) < _ALIKE * length else None
 
 
 def prepared(arm: Chain, commands: Array, measured: Array | None = None) -> Chain:
@@ -414,9 +412,8 @@ def prepared(arm: Chain, commands: Array, measured: Array | None = None) -> Chai
     """
     require_readings(arm, commands, measured)
     arm = arm.located(commands, measured)
-    if measured is not None:
-        for part in arm.readings(commands, measured):
-            require_touched(part.sensor, part.columns)
+    for part in () if measured is None else arm.readings(commands, measured):
+        require_touched(part.sensor, part.columns)
     require_places(arm, commands, measured)
     return arm
 
@@ -440,8 +437,8 @@ def prepared_chains(
     arms = _located(model, tables)
     of_members = {} if measured is None else model._by_member(arms, tables)
     for readings in of_members.values():
-        columns = [of_chain.columns for of_chain in readings]
-        require_touched(readings[0].sensor, np.vstack(columns))
+        columns = np.vstack([of_chain.columns for of_chain in readings])
+        require_touched(readings[0].sensor, columns)
     for k, arm_commands, read in tables:
         with model._naming(k):
             require_places(arms[k], arm_commands, read)

@@ -104,9 +104,8 @@ class ReachableSet:
         self.arm, self.targets = _aimed(arm, near)
         self.turning = np.array(self.arm.command_units) == "deg"
         limits = self.arm.limits
-        self.limits = np.where(
-            self.turning[:, None], limits.clip(-180.0, 180.0), limits
-        )
+        turned = limits.clip(-180.0, 180.0)
+        self.limits = np.where(self.turning[:, None], turned, limits)
 
     def __call__(self, command: Array) -> bool:
         """Whether the arm can be measured at a command (n,)."""
@@ -144,12 +143,12 @@ class ReachableSet:
             commands = towards_zero(arm, commands, self.limits, limit)
             reached = np.linalg.norm(arm.predict(commands), axis=1) <= limit
             why = "cannot reach it within the limits"
-            reasons = ["" if one else why for one in reached]
+            reasons = np.where(reached, "", why).tolist()
         elif self.targets is not None:
             points = arm.nominal_tip(commands).position
             far = np.linalg.norm(points[:, None] - self.targets[:, :3], axis=-1)
             close = (far <= self.targets[:, 3]).any(axis=1)
-            reasons = ["" if one else "are not near" for one in close]
+            reasons = np.where(close, "", "are not near").tolist()
         if self.floor > -np.inf:
             heights = arm.skeleton(commands)[..., 2]
             heights[:, -1] += _SUNK * arm.length
@@ -171,9 +170,8 @@ class ReachableSet:
         centre = np.column_stack([(aim - [cx, cy]) / [fx, fy], np.ones(count)])
         centre *= (far / np.linalg.norm(centre, axis=1))[:, None]
         # A board that faces the camera, turned about its axis, then tilted.
-        side = np.full(count, view.side)
-        if not view.side:
-            side = rng.choice([-1.0, 1.0], count)
+        either = not view.side
+        side = rng.choice([-1.0, 1.0], count) if either else np.full(count, view.side)
         facing = Rotation.from_rotvec((side[:, None] > 0.0) * [np.pi, 0.0, 0.0])
         about_axis = rng.uniform(-np.pi, np.pi, count)[:, None]
         spin = Rotation.from_rotvec(about_axis * [0.0, 0.0, 1.0])
@@ -278,25 +276,23 @@ def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:
     sensor = arm.sensor
     places = None if near is None else np.atleast_2d(numbers("near", near))
     if isinstance(sensor, Socket | Plane):
-        if places is None and sensor.places is None:
+        if places is not None:
+            aimed = dataclasses.replace(sensor, count=len(places), places=places)
+            return arm.measured_with(aimed), None
+        if sensor.places is None:
             raise ValueError(
                 f"near is missing: the rough place of each {sensor.kind}, (S, "
                 f"{sensor.width}). arm.located(commands) finds it from contacts made "
                 "by hand"
             )
-        if places is not None:
-            aimed = dataclasses.replace(sensor, count=len(places), places=places)
-            arm = arm.measured_with(aimed)
         return arm, None
-    if isinstance(sensor, Board):
-        if sensor.place is None:
-            raise ValueError(
-                "place is missing, Board(place=...): the place of the board or camera "
-                "is unknown and near does not give it. arm.located(commands, measured) "
-                "finds it from three views; on the command line --measured"
-            )
-        return arm, None
-    if places is not None:
+    if isinstance(sensor, Board) and sensor.place is None:
+        raise ValueError(
+            "place is missing, Board(place=...): the place of the board or camera "
+            "is unknown and near does not give it. arm.located(commands, measured) "
+            "finds it from three views; on the command line --measured"
+        )
+    if places is not None and not isinstance(sensor, Board):
         rule = f", rows (x, y, z, radius) for {sensor.kind}"
         places = array_of("near", places, "N", 4, rule=rule)
     return arm, places
@@ -402,9 +398,8 @@ def in_picture(arm: Chain, commands: Array, view: View) -> tuple[Array, list[str
     away = np.linalg.norm(there, axis=1)
     face = (rotation[:, :, 2] * -there).sum(axis=1) / np.maximum(away, 1e-9)
     why = np.full(len(spots), "", dtype=object)
-    why[np.abs(face) < np.cos(np.radians(view.tilt))] = (
-        "see the board at too flat an angle"
-    )
+    flat = np.abs(face) < np.cos(np.radians(view.tilt))
+    why[flat] = "see the board at too flat an angle"
     why[(away < view.ends[0]) | (away > view.ends[1])] = "are too near or too far"
     why[~inside.all(axis=1)] = "do not have the whole board in the picture"
     if view.side:

@@ -72,7 +72,7 @@ class Readings(NamedTuple):
     kind: str = ""  # of it, for a message
     title: str = ""  # that, "" where there are no others
     own: Any = slice(0)  # of the arm's parameters
-    judged: Any = None  # (D,) distances, of one of several arms alone
+    judged: Any = np.False_  # (D,) distances, of one of several arms alone
 
     def groups(self) -> list[Rows]:
         """Rows of each socket, plane or anchor, in the order of measuring."""
