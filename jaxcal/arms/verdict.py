@@ -137,8 +137,7 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
     unit = fit.measured_unit
     usual, reason = np.asarray(model.default_noise().std), None
     if fit.noise_std is None:
-        stds = np.broadcast_to(usual, (fit.num_outputs,))
-        stds = stds if np.ptp(stds) else stds[:1]
+        stds = usual if np.ptp(usual) else usual.ravel()[:1]
         reason = Reason(
             no_noise(fit, "intervals and no verdict"),
             "measure more postures, or state noise_std, --noise (usual for this "
@@ -175,9 +174,8 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
     reasons, clean, step = findings_of(
         fit, used, parts, scattered, mistaken, vague, more
     )
-    place = None
-    if all(part.sensor.views for part in parts):
-        place = place_of(fit, [f"tool {axis}" for axis in Pose.tool])
+    camera = all(part.sensor.views for part in parts)
+    place = place_of(fit, [f"tool {axis}" for axis in Pose.tool]) if camera else None
     reach = model.length or float(np.ptp(parts[0].tip.position, axis=0).max())
     if place is not None and place.hidden:
         reasons += (
@@ -187,8 +185,7 @@ def verdict(model: Chain, fit: Fit) -> ArmVerdict:
         )
     if not explains and not fit.noise_known:
         unit_of_first = "" if errors[0].unit == "length" else f" {errors[0].unit}"
-        effects = in_words(fit, unit_of_first) + play_in_words(fit)
-        reasons += tuple(effects)
+        reasons += (*in_words(fit, unit_of_first), *play_in_words(fit))
     if accuracy is not None:
         good = clean and not _missed(errors, accuracy)
     elif place is not None and place.std[0] < _PLACED * reach and explains:
@@ -335,9 +332,8 @@ def _anywhere(fit: Fit, model: Chain, parts: list[Readings]) -> tuple[Readings, 
     low = np.where(turning, low, joints.min(axis=0))
     high = np.where(turning, high, joints.max(axis=0))
     drawn = np.random.default_rng(0).uniform(low, high, (_DRAWN, model.num_joints))
-    slopes, covariance = linearised(
-        fit, np.hstack([drawn, np.repeat(columns, _DRAWN, axis=0)])
-    )
+    postures = np.hstack([drawn, np.repeat(columns, _DRAWN, axis=0)])
+    slopes, covariance = linearised(fit, postures)
     slopes = slopes[:, :3] * part.scale[:3, None]
     slopes[..., part.own] = 0.0
     null = fit.unidentified
@@ -359,17 +355,15 @@ def of_chain(model: Chains, fit: Any, tip: str) -> dict[str, Any]:
     arm, at, scale = model.chains[k], fit.whole.members[k], model._scale(k)
     q, rows = arm.num_outputs, fit.commands[:, len(model.joint_names)] == k
     residuals = fit.residuals[rows, :q] * scale
-    noise = None if fit.noise_std is None else fit.noise_std[:q] * scale
-    square = fit.square
+    noise, square = fit.noise_std, fit.square
     if noise is not None:
-        weights = fit.loss_weights[rows]
+        noise, weights = noise[:q] * scale, fit.loss_weights[rows]
         square = float((weights[:, None] * (residuals / noise) ** 2).sum())
     share = int(rows.sum()) * q / max(len(fit.commands) * model.num_outputs, 1)
-    null = fit.unidentified
+    null, joint = fit.unidentified, fit.joint_covariance
     if null is not None:
         null = null[:, at]
-        null = null[np.abs(null).max(axis=1, initial=0.0) > 0.0]
-    joint = fit.joint_covariance
+        null = null[null.any(axis=1)]
     by_parameter = ("estimate", "prior_mean", "prior_precision", "free")
     by_row = ("loss_weights", "distance")
     return {

@@ -128,7 +128,7 @@ def static_transform(
     ]
     tool = [f"tool {axis}" for axis in sensor.tool]
     owns = [model.names[model._own(i)] for i in range(len(sensors))]
-    fitted = {*tool, *(name for own in owns for name in own)}
+    fitted = {*tool, *sum(owns, ())}
     held = tuple(name for name in model.names if name not in fitted)
     again = fitted_again(fit, model, Prior(model.default_prior().std, fixed=held))
     theta, source = again.parameters, model.source
@@ -199,19 +199,18 @@ def _text(form: str, pose: StaticTransform) -> str:
             )
         return with_origins(text, {}, frame)
     numbers = [*pose.matrix[:3, 3].tolist(), *pose.quaternion.tolist()]
-    keys = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    values = {key: repr(float(x)) for key, x in zip(keys, numbers, strict=True)}
+    values = [repr(float(x)) for x in numbers]
     if form in (".yaml", ".yml"):
-        shift = ", ".join(f"{key}: {values[key]}" for key in keys[:3])
-        turn = ", ".join(f"{key[1]}: {values[key]}" for key in keys[3:])
+        named = [f"{key}: {x}" for key, x in zip("xyzxyzw", values, strict=True)]
+        shift, turn = ", ".join(named[:3]), ", ".join(named[3:])
         return (
             f"# {pose}\nheader: {{frame_id: {pose.parent}}}\n"
             f"child_frame_id: {pose.child}\n"
             f"transform:\n  translation: {{{shift}}}\n  rotation: {{{turn}}}\n"
         )
-    words = [word for key in keys for word in (f"--{key}", values[key])]
-    words += ["--frame-id", pose.parent, "--child-frame-id", pose.child]
-    call = " ".join(words)
+    keys = ("x", "y", "z", "qx", "qy", "qz", "qw", "frame-id", "child-frame-id")
+    both = zip(keys, [*values, pose.parent, pose.child], strict=True)
+    call = " ".join(f"--{key} {word}" for key, word in both)
     return f"# {pose}\nros2 run tf2_ros static_transform_publisher {call}\n"
 
 
@@ -271,11 +270,12 @@ class ArmCalibration(Calibration):
             names: motors not named as the joints: {"Rotation": "shoulder_pan"}.
         """
         plain = self.model.writable()
-        zeros = [name for name in plain.names if name.startswith("theta")]
-        tool = [name for name in plain.names if "tool" in name]
-        fitted = (*zeros, *plain.sensor.names, *tool)
-        prior = plain.default_prior()
-        held = tuple(name for name in plain.names if name not in fitted)
+        prior, own = plain.default_prior(), plain.sensor.names
+        held = (
+            name
+            for name in plain.names
+            if not (name.startswith("theta") or "tool" in name or name in own)
+        )
         fixed = tuple(dict.fromkeys((*prior.fixed, *held)))
         again = fitted_again(self, plain, dataclasses.replace(prior, fixed=fixed))
         steps = write_servos(

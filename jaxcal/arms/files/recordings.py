@@ -105,13 +105,11 @@ def _rests_of(
     if messages is None:
         return postures, None
     at, values = messages
-    readings = []
-    for number, (first, last) in enumerate(spans):
-        there = (at >= first) & (at <= last)
-        if not there.any():
+    there = [(at >= first) & (at <= last) for first, last in spans]
+    for number, rows in enumerate(there):
+        if not rows.any():
             raise ValueError(f"{path}: rest {number} has no reading of the sensor")
-        readings.append(values[there].mean(axis=0))
-    return postures, np.array(readings)
+    return postures, np.array([values[rows].mean(axis=0) for rows in there])
 
 
 def _vector(part: Any) -> list[float]:
@@ -151,8 +149,7 @@ def _bag(
     path: pathlib.Path, names: Sequence[str], kind: str, topic: str
 ) -> tuple[Array, Array, tuple[Array, Array] | None]:
     """Times (T,) and joints (T, J) in radians, metres; times and values of messages."""
-    times, rows = [], []
-    at, values = [], []
+    times, rows, at, values = [], [], [], []
     joints_met: set[str] = set()
     with _opened(path) as bag:
         types = _MESSAGES.get(kind, {})
@@ -321,10 +318,8 @@ class Servos:
         if not self.motors:
             raise ValueError("motors must hold at least one motor")
         for name, motor in self.motors.items():
-            numbers = (
-                [motor.get(x) for x in _KEYS] if isinstance(motor, Mapping) else [""]
-            )
-            if not all(isinstance(number, int) for number in numbers):
+            given = motor if isinstance(motor, Mapping) else {}
+            if not all(isinstance(given.get(key), int) for key in _KEYS):
                 raise ValueError(
                     f"motor {name} must have {', '.join(_KEYS)}, whole numbers, "
                     f"got {motor!r}"

@@ -56,14 +56,10 @@ def read_urdf(
     try:
         chain = list(walk(text, base, tip, locked))
         (first, down), (last, ends_down) = chain[0], chain[-1]
-        return described(
-            {
-                "text": text,
-                "locked": dict(locked),
-                "base": first.parent if down else first.child,
-                "tip": last.child if ends_down else last.parent,
-            }
-        )
+        base = first.parent if down else first.child
+        tip = last.child if ends_down else last.parent
+        source = {"text": text, "locked": dict(locked), "base": base, "tip": tip}
+        return described(source)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 
@@ -358,13 +354,13 @@ def read_ur_kinematics(path: AnyPath) -> dict[str, Any]:
     """Arguments of ``from_dh``, of Universal Robots' kinematics file."""
     text = pathlib.Path(path).read_text(encoding="utf-8")
     poses: dict[str, dict[str, float]] = {}
+    link, parts = "", []
     for line in text.splitlines():
         key, _, value = line.partition("#")[0].strip().partition(":")
         if key in UR:
-            poses[key] = {}
-        elif poses and key in ("x", "y", "z", "roll", "pitch", "yaw"):
-            poses[[*poses][-1]][key] = float(value)
-    parts = []
+            link = key
+        elif link and key in ("x", "y", "z", "roll", "pitch", "yaw"):
+            poses.setdefault(link, {})[key] = float(value)
     for link, name in UR.items():
         if len(poses.get(link, ())) != 6:
             raise ValueError(

@@ -169,10 +169,8 @@ def _dh_text(calibrated: Arm) -> str:
     table = calibrated.table.copy()
     at = [3 if kind == "R" else 2 for kind in calibrated.joints]  # theta or d
     table[range(len(at)), at] += calibrated.offset
-    rows = [
-        ",".join([name, *map(repr, row)])
-        for name, row in zip(names, table.tolist(), strict=True)
-    ]
+    both = zip(names, table.tolist(), strict=True)
+    rows = [",".join([name, *map(repr, row)]) for name, row in both]
     return "\n".join(["joint,a,alpha,d,theta,beta", *rows, ""])
 
 
@@ -225,8 +223,7 @@ def _ur_text(nominal: Arm, calibrated: Arm) -> str:
     for name, frame, zero in zip(UR, frames, nominal.offset, strict=True):
         pose = pose_words(frame @ row_matrix(np.array([0.0, 0.0, 0.0, zero, 0.0])))
         values = f"{pose['xyz']} {pose['rpy']}".split()
-        keys = ("x", "y", "z", "roll", "pitch", "yaw")
-        pairs = zip(keys, values, strict=True)
+        pairs = zip(("x", "y", "z", "roll", "pitch", "yaw"), values, strict=True)
         lines += [f"  {name}:", *(f"    {key}: {value}" for key, value in pairs)]
     return "\n".join([*lines, "  hash: calibrated_by_jaxcal", ""])
 
@@ -270,8 +267,7 @@ def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | N
                 f"base {base!r} moves with its joint and cannot be "
                 "corrected: choose or add a link fixed to it as base"
             )
-        driving = [k for k, part in enumerate(gap) if part.leader]
-        at = driving[-1] if driving else len(gap) - 1
+        at = max((k for k, x in enumerate(gap) if x.leader), default=len(gap) - 1)
         before, after = _product(gap[:at]), _product(gap[at + 1 :])
         part, held = gap[at], np.linalg.inv(before) @ matrix @ np.linalg.inv(after)
         whole = held if part.down else np.linalg.inv(held)
@@ -308,12 +304,11 @@ def with_origins(text: str, origins: Mapping[str, Array], more: str = "") -> str
     for name, matrix in origins.items():
         pose = pose_words(matrix)
         joint, origin = places[name]
+        end = _end_of_tag(data, joint if origin is None else origin)
         if origin is None:
             tag = f'{newline}    <origin xyz="{pose["xyz"]}" rpy="{pose["rpy"]}"/>'
-            end = _end_of_tag(data, joint)
             edits.append((end, end, tag.encode()))
             continue
-        end = _end_of_tag(data, origin)
         tag = data[origin:end].decode("utf-8", "surrogateescape")
         for key, words in pose.items():
             there = re.compile(rf"""(\s{key}\s*=\s*)(["'])[^"']*\2""")

@@ -101,12 +101,12 @@ class Gravity(AtRest):
             )
         directions = measured / size
         up = np.einsum("nij,nj->i", tip.rotation, directions) / len(directions)
-        if np.linalg.norm(up) > 0.8 and up @ self.up < _ASIDE * np.linalg.norm(up):
+        agreement, up = np.linalg.norm(up), up / (np.linalg.norm(up) or 1.0)
+        if agreement > 0.8 and up @ self.up < _ASIDE:
             raise ValueError(
                 "gravity readings must point along up, "
-                f"{in_words(np.round(self.up, 2))}, got "
-                f"{in_words((up / np.linalg.norm(up)).round(2) + 0.0)} on average: "
-                "give that as up=, or negate them if the sensor reads down"
+                f"{in_words(np.round(self.up, 2))}, got {in_words(up.round(2) + 0.0)} "
+                "on average: give that as up=, or negate them if the sensor reads down"
             )
         felt = np.array(self.up) @ tip.rotation
         spread = np.linalg.svd(felt.T @ directions, compute_uv=False)
@@ -255,9 +255,7 @@ class Wrench(AtRest):
                 rows = np.matrix_transpose(rows).reshape(-1, 3)
                 down = np.linalg.lstsq(rows, (force @ turn.T).ravel(), rcond=None)[0]
         if best < off / 10.0 and up @ self.up < _UPRIGHT:
-            there, other = (
-                in_words((sign * up).round(2) + 0.0) for sign in (1.0, -1.0)
-            )
+            there, other = (in_words(x.round(2) + 0.0) for x in (up, -up))
             raise ValueError(
                 f"forces fit an arm with up = {there}, or with up = {other} if the "
                 "sensor reads the holding force, not up = "

@@ -282,15 +282,10 @@ class Board(Sensor):
         rays = (pixels.reshape(len(pixels), -1, 2) - centre) / focal
         size = np.abs(flat).max()
         one = np.column_stack([flat / size, np.ones(len(flat))])
-        zero = np.zeros((len(pixels), *one.shape))
-        ones = zero + one
-        rows = np.concatenate(
-            [
-                np.concatenate([ones, zero, -rays[..., :1] * ones], axis=-1),
-                np.concatenate([zero, ones, -rays[..., 1:] * ones], axis=-1),
-            ],
-            axis=1,
-        )
+        rows = np.zeros((len(pixels), 2, len(flat), 9))  # of u, then of v
+        rows[:, 0, :, :3] = rows[:, 1, :, 3:6] = one
+        rows[..., 6:] = -rays.transpose(0, 2, 1)[..., None] * one
+        rows = rows.reshape(len(pixels), -1, 9)
         plane = np.linalg.svd(rows)[2][:, -1].reshape(-1, 3, 3)
         plane = plane * np.sign(plane[:, 2:, 2:])  # the board is before the camera
         x, y = plane[..., 0] / size, plane[..., 1] / size

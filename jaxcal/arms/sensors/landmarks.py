@@ -155,16 +155,15 @@ class Socket(Landmarks):
 
     def facts(self, parameters: Array) -> tuple[Array, Array]:
         places = parameters.reshape(-1, 3)
-        off = np.zeros(len(self.distances))
-        rows = np.zeros((len(self.distances), self.count, 3))
-        for k, (first, second, distance, std) in enumerate(self.distances):
-            i, j = int(first), int(second)
-            apart = places[j] - places[i]
-            far = float(np.linalg.norm(apart))
-            off[k] = (distance - far) / std
-            rows[k, j] = (apart / far if far else np.eye(3)[0]) / std
-            rows[k, i] = -rows[k, j]
-        return off, rows.reshape(len(off), parameters.size)
+        table = np.array(self.distances).reshape(-1, 4)
+        (i, j), (distance, std) = table[:, :2].T.astype(np.intp), table[:, 2:].T
+        apart = places[j] - places[i]
+        far = np.linalg.norm(apart, axis=1)
+        apart[far == 0.0] = np.eye(3)[0]
+        rows, each = np.zeros((len(far), self.count, 3)), np.arange(len(far))
+        rows[each, j] = apart / np.where(far > 0.0, far, 1.0)[:, None] / std[:, None]
+        rows[each, i] = -rows[each, j]
+        return (distance - far) / std, rows.reshape(len(far), parameters.size)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -87,14 +87,13 @@ class Several(Sensor):
         kinds = [one.kind for one in self.sensors]
         named = []
         for i, one in enumerate(self.sensors):
-            title = one.kind if kinds.count(one.kind) == 1 else f"{one.kind} {i}"
+            alone = kinds.count(one.kind) == 1
+            title = one.kind if alone else f"{one.kind} {i}"
             for axis in self._axes(i):
-                named.append(
-                    (f"{title} tool {axis}", "deg" if "r" in axis else "length")
-                )
-            for name, unit in zip(one.names, one.units, strict=True):
-                alone = title == one.kind
-                named.append((name if alone else f"{title}: {name}", unit))
+                unit = "deg" if "r" in axis else "length"
+                named.append((f"{title} tool {axis}", unit))
+            names = one.names if alone else [f"{title}: {name}" for name in one.names]
+            named += zip(names, one.units, strict=True)
         return named
 
     @property
@@ -207,12 +206,9 @@ class Several(Sensor):
 
     @property
     def own_of_members(self) -> tuple[slice, ...]:
-        first, slices = 0, []
-        for i, one in enumerate(self.sensors):
-            first += len(self._axes(i))
-            slices.append(slice(first, first + len(one.names)))
-            first += len(one.names)
-        return tuple(slices)
+        sizes = [(len(self._axes(i)), len(x.names)) for i, x in enumerate(self.sensors)]
+        ends = np.cumsum(sizes).reshape(-1, 2).tolist()
+        return tuple(slice(*both) for both in ends)
 
     def with_member(self, i: int, sensor: Sensor) -> Self:
         sensors = (*self.sensors[:i], sensor, *self.sensors[i + 1 :])
