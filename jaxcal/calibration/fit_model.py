@@ -78,8 +78,15 @@ def fit_model(
     that must vary in every direction."""
     one_of("loss", loss, tuple(LOSSES))
     require_kind("prior", prior, Prior)
-    weights = _distinct_weights(model, commands, measured, weights)
-    used = slice(None) if weights.all() else weights > 0.0
+    if not weights.any():
+        raise ValueError("weights must be positive for at least one measurement")
+    used: slice | Mask = slice(None) if weights.all() else weights > 0.0
+    once = model.fitting.distinct(commands[used], measured[used])
+    if len(once) < len(weights):  # what is written twice counts once
+        rows = np.flatnonzero(weights)[once]
+        weights, given = np.zeros_like(weights), weights
+        weights[rows] = given[rows]
+        used = weights > 0.0
     spread = command_noise(noise, commands, measured.shape[1])
     exact = not spread.any()
     model = model.fitting.prepared(commands[used], measured[used])
@@ -170,21 +177,6 @@ def _problem(
         first_log_size=model.fitting.log_size(counted, mean),
     )
     return problem, centre
-
-
-def _distinct_weights(
-    model: Model, commands: Array, measured: Array, weights: Array
-) -> Array:
-    """(N,) the weights of the measurements that count, 0 elsewhere."""
-    if not weights.any():
-        raise ValueError("weights must be positive for at least one measurement")
-    used = slice(None) if weights.all() else weights > 0.0
-    once = model.fitting.distinct(commands[used], measured[used])
-    if len(once) == len(weights):
-        return weights
-    rows, distinct = np.flatnonzero(weights)[once], np.zeros_like(weights)
-    distinct[rows] = weights[rows]
-    return distinct
 
 
 def _solve_with_misfit(

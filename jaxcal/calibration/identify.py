@@ -137,9 +137,8 @@ def identify(
         provenance["accuracy"] = by_unit("accuracy", accuracy, judged)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
-    if loss is None and prior is None:
-        if affine or model.affine(model.nominal) is not None:
-            loss = "gaussian"
+    if loss is None and prior is None and model.affine(model.nominal) is not None:
+        loss = "gaussian"
     try:
         fields = fit_model(
             u,
@@ -159,9 +158,8 @@ def identify(
             raise
         raise ValueError(f"{mispaired.reason}. Uncorrected: {error}") from None
     fields["provenance"] = provenance | fields["provenance"]
-    fields |= {"input_names": inputs, "output_names": outputs}
     kind: Any = fields["model"].fitting.result_type or Calibration
-    calibration = kind(**fields, **units)
+    calibration = kind(input_names=inputs, output_names=outputs, **fields, **units)
     if prior is None and plain_noise:
         calibration = model.fitting.improved(calibration)
     if sessions is not None:
@@ -265,10 +263,8 @@ def _provenance(
         noted = json.loads(json.dumps(dict(notes), allow_nan=False)) if notes else {}
     except (TypeError, ValueError) as error:
         raise ValueError(f"notes must be valid JSON: {error}") from None
-    content = b"".join(
-        str(array.shape).encode() + array.astype("<f8", copy=False).tobytes()
-        for array in data
-    )
+    parts = [(str(x.shape).encode(), x.astype("<f8", copy=False)) for x in data]
+    content = b"".join(shape + array.tobytes() for shape, array in parts)
     return {
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "packages": {
@@ -290,7 +286,7 @@ def _with_sessions(fit: Calibration, labels: ArrayLike) -> Calibration:
             f"sessions must be two or more labels, of {len(fit.commands)} rows,"
             f" got shape {np.shape(labels)} and {len(names)} labels"
         )
-    square, expected = [], []
+    excess = []
     for label in range(len(names)):
         try:
             trial = fitted_again(fit, fit.model, stated_prior(fit), which != label)
@@ -299,14 +295,13 @@ def _with_sessions(fit: Calibration, labels: ArrayLike) -> Calibration:
         rows = (which == label) & (fit.loss_weights > 0.0)
         if trial.noise_std is not None and rows.any():
             commands = fit.commands[rows]
-            off = fit.model.fitting.wrapped(
-                fit.measured[rows] - outputs_at(trial, commands), commands
-            )
-            square.append(off**2)
-            expected.append(trial.predict_std(commands, new_measurement=True) ** 2)
-    if not square:
+            off = fit.measured[rows] - outputs_at(trial, commands)
+            off = fit.model.fitting.wrapped(off, commands)
+            std = trial.predict_std(commands, new_measurement=True)
+            excess.append(off**2 - std**2)
+    if not excess:
         raise ValueError("sessions: each fit without one session must be possible")
-    excess = np.vstack(square).mean(axis=0) - np.vstack(expected).mean(axis=0)
-    about = {"count": len(names), "std": np.sqrt(excess.clip(0.0)).tolist()}
+    variance = np.vstack(excess).mean(axis=0).clip(0.0)
+    about = {"count": len(names), "std": np.sqrt(variance).tolist()}
     provenance = {**fit.provenance, "sessions": about}
     return dataclasses.replace(fit, provenance=provenance)

@@ -145,9 +145,7 @@ class FitSolution:
             self.facts, self.fact_rows = problem.model.fitting.facts(self.parameters)
             self._linearise()
         else:
-            for name in _SHARED:
-                if name in vars(start):
-                    setattr(self, name, getattr(start, name))
+            vars(self).update({x: vars(start)[x] for x in _SHARED if x in vars(start)})
             if start.problem.white is not problem.white:
                 self._take(self.residuals)
                 self.level = self._first_level()
@@ -177,8 +175,6 @@ class FitSolution:
 
     def _changed(self, step: Array) -> Array:
         """(P,) the parameters with a step (F,) of the free ones."""
-        if self.all_free:
-            return self.parameters + step
         theta = self.parameters.copy()
         theta[self.problem.free] += step
         return theta
@@ -217,9 +213,9 @@ class FitSolution:
         if self.basis is not None:  # derivatives stay what they are
             return
         rows = derivative(problem.model, self.commands, self.parameters)
-        if not problem.model.linear:  # those of a linear model are exact
-            if (idle := without_effect(rows, self.sizes)).any():
-                rows = np.where(idle, 0.0, rows)
+        exact = problem.model.linear
+        if not exact and (idle := without_effect(rows, self.sizes)).any():
+            rows = np.where(idle, 0.0, rows)
         if not self.all_free:
             rows = rows.compress(problem.free, axis=-1)
         self.by_theta = self.whitened(rows)
@@ -435,10 +431,8 @@ class FitSolution:
         if not problem.noise_known:
             self._climb(distance)
         after = self.weights, np.log(self.level)
-        return all(
-            np.abs(new - old).max() < slack * limit
-            for new, old, limit in zip(after, before, self.change, strict=True)
-        )
+        moves = zip(after, before, self.change, strict=True)
+        return all(np.abs(new - old).max() < slack * most for new, old, most in moves)
 
     def _level(self) -> Array:
         """(q,) sums of squares over the degrees of freedom that they have."""

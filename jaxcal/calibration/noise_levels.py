@@ -147,9 +147,9 @@ def _best(square: Array, freedom: Array) -> _Levels:
             others.append(_Levels(says, np.arange(q) % turn, None, turn))
     if q >= 4:
         others.append(_blocks(square, freedom, seen))
-    if q >= 2 * _DEGREES:
-        shapes = (_smooth(square, freedom, seen, k + 1) for k in range(_DEGREES))
-        others += [shape for shape in shapes if shape is not None]
+    degrees = range(1, 1 + _DEGREES if q >= 2 * _DEGREES else 1)
+    shapes = (_smooth(square, freedom, seen, degree) for degree in degrees)
+    others += [shape for shape in shapes if shape is not None]
     best = min(others, key=evidence)
     return best if evidence(best) + _STRONG < evidence(one) else one
 

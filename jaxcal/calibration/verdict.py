@@ -235,8 +235,8 @@ def _unsigned(fit: Fit) -> Reason | None:
     readings = fit.measured
     if not (fit.model.linear and readings.max() >= 2.0**15):
         return None
-    for bits in (16, 32):
-        whole, half = 2.0**bits, 2.0 ** (bits - 1)
+    for whole in (2.0**16, 2.0**32):
+        half = 0.5 * whole
         within = (readings >= 0.0).all(axis=0) & (readings < whole).all(axis=0)
         for j in np.flatnonzero(within & (readings >= half).any(axis=0)):
             slopes = fit.model.jacobian(fit.commands, fit.parameters)[:, j]
@@ -318,21 +318,18 @@ def bends(fit: Fit) -> Reason | None:
     unit /= np.fmax(np.abs(unit).max(axis=0), 1e-300)
     squares = np.hstack([unit, unit[:, i] * unit[:, j]])
     of_unit = f" {fit.measured_unit}".rstrip()
-    remedy = (
-        "identify with a model that has these terms (Polynomial or another), or "
-        "measure over a smaller range"
-    )
     for terms, what in (
         (squares, "squares and products of the commands"),
         (np.hstack([squares, unit**3]), "squares, products and cubes of the commands"),
     ):
-        if len(unit) > 2 * terms.shape[1] and 2 * terms.shape[1] * m <= _TERMS:
-            if share := _left_by(fit, sample, terms):
-                return Reason(
-                    f"Residuals follow a curve: of a noise of {each(noise)}{of_unit}, "
-                    f"{what} would leave {each(noise * share)}{of_unit}.",
-                    remedy,
-                )
+        few = len(unit) > 2 * terms.shape[1] and 2 * terms.shape[1] * m <= _TERMS
+        if few and (share := _left_by(fit, sample, terms)):
+            return Reason(
+                f"Residuals follow a curve: of a noise of {each(noise)}{of_unit}, "
+                f"{what} would leave {each(noise * share)}{of_unit}.",
+                "identify with a model that has these terms (Polynomial or another), "
+                "or measure over a smaller range",
+            )
     if fit.model.linear and count >= _SMOOTH and (along := _smooth(fit)):
         output, command = along
         return Reason(
