@@ -232,14 +232,12 @@ class SerialChain(Arm, Model):
         """This arm with these effects of joints, from 1, beside those that it has."""
         new: dict[str, Any] = {"gears": tuple(gears)} if gears else {}
         if compliance and not self.compliance:
-            new |= {
-                "compliance": tuple(compliance),
-                "yields": np.zeros(len(compliance)),
-            }
+            stiff = np.zeros(len(compliance))
+            new |= {"compliance": tuple(compliance), "yields": stiff}
             new["loads"] = self.loads or _usual_loads(len(self.joints), self.tool)
         if harmonics and not self.harmonics:
-            new["harmonics"] = tuple(harmonics)
-            new["waves"] = np.zeros((len(harmonics), 4))
+            waves = np.zeros((len(harmonics), 4))
+            new |= {"harmonics": tuple(harmonics), "waves": waves}
         return dataclasses.replace(self, **new)
 
     @functools.cached_property  # kept, and what it keeps with it
@@ -275,8 +273,8 @@ class SerialChain(Arm, Model):
         """This arm with stiff joints and round gears, as files have them."""
         if not self.compliance and not self.harmonics:
             return self
-        arm = dataclasses.replace(self, compliance=(), yields=np.zeros(0))
-        return dataclasses.replace(arm, harmonics=(), waves=np.zeros((0, 4)))
+        stiff = {"compliance": (), "yields": np.zeros(0)}
+        return dataclasses.replace(self, **stiff, harmonics=(), waves=np.zeros((0, 4)))
 
     def together(
         self, *tables: tuple[ArrayLike, ArrayLike | None]
@@ -326,10 +324,8 @@ class SerialChain(Arm, Model):
         commands, theta = as_commands(self, commands), as_parameters(self, parameters)
         columns, by_sensor = self._motion(commands, theta, self._steps_of_parameters)
         at, own = self._at, self._at["sensor"].start
-        result = columns
-        if by_sensor.shape[-1]:
-            parts = [columns[..., :own], by_sensor, columns[..., own:]]
-            result = np.concatenate(parts, axis=-1)
+        parts = [columns[..., :own], by_sensor, columns[..., own:]]
+        result = np.concatenate(parts, axis=-1) if by_sensor.shape[-1] else columns
         swing, goes = self._swing(commands, theta)
         if self.gears:
             joints = [i - 1 for i in self.gears]

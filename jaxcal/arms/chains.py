@@ -131,11 +131,8 @@ class Chains(Model):
     @functools.cached_property
     def _firsts(self) -> list[int]:
         """(C,) the first chain that has the base of each."""
-        arms = self.chains
-        return [
-            next(j for j in range(k + 1) if j == k or common(arms[j], arms[k]))
-            for k in range(len(arms))
-        ]
+        arms = [*enumerate(self.chains)]
+        return [next(j for j, b in arms if j == k or common(b, a)) for k, a in arms]
 
     @functools.cached_property
     def _members(self) -> list[list[tuple[int, int]]]:
@@ -162,9 +159,8 @@ class Chains(Model):
     def _named(self) -> list[list[str]]:
         """Names in this model of the parameters of each chain."""
         named = []
-        for k, (tip, arm, shared) in enumerate(
-            zip(self.tips, self.chains, self._shared, strict=True)
-        ):
+        each = zip(self.tips, self.chains, self._shared, strict=True)
+        for k, (tip, arm, shared) in enumerate(each):
             links = [f"{name}{i}" for i in range(1, shared) for name in COLUMNS]
             of_joint = ("gear{}", "compliance{}", *(f"theta{{}} {w}" for w in WAVES))
             joints = [n.format(i) for i in range(1, shared + 1) for n in of_joint]

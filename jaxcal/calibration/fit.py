@@ -213,8 +213,7 @@ class Fit:
         """Outputs (..., m) at commands (..., n); a warning tells of far ones."""
         points = as_points(self, "commands", commands, self.num_inputs)
         rows = points.reshape(-1, self.num_inputs)
-        sides = [(self.input_names, rows, self._range)]
-        say_far("command", slice(None), sides)
+        say_far("command", slice(None), [(self.input_names, rows, self._range)])
         return outputs_at(self, points)
 
     @functools.cached_property
@@ -348,11 +347,11 @@ def studentised(fit: Fit) -> tuple[Array, float]:
 
 def unseen_directions(fit: Fit) -> Array:
     """(z, P) directions that nothing determines, as ``linearised`` has the slopes."""
-    null = fit.unidentified
-    null = np.zeros((0, len(fit.estimate))) if null is None else null
+    if fit.unidentified is None:
+        return np.zeros((0, len(fit.estimate)))
     if fit.centre is None:
-        return null
-    return null @ np.asarray(fit.model.fitting.centred(fit.centre)).T
+        return fit.unidentified
+    return fit.unidentified @ np.asarray(fit.model.fitting.centred(fit.centre)).T
 
 
 def as_points(fit: Fit, name: str, values: ArrayLike, width: int) -> Array:
@@ -417,7 +416,7 @@ def say_far(
 ) -> None:
     """Warn of points (``what`` they are) far outside of what was measured: of each side
     names of columns, points (P, k), and (N, k), of which ``used`` (N,) count."""
-    far, worst, count = set(), "", 0
+    far, worst, count = set(), "", len(sides[0][1])
     for names, values, measured in sides:
         low, high = measured[used].min(axis=0), measured[used].max(axis=0)
         width = np.where(high > low, high - low, np.inf)
@@ -429,7 +428,6 @@ def say_far(
                 f"{what} {i + 1} has {names[j]} = {values[i, j]:.6g}, measured "
                 f"range {low[j]:.6g} to {high[j]:.6g}"
             )
-        count = len(values)
     if far:
         warn(
             f"{len(far)} of {count} {what}s {'is' if len(far) == 1 else 'are'} far "

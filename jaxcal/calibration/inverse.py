@@ -103,9 +103,9 @@ def no_inverse(fit: Fit) -> str:
     if fit.num_outputs > fit.num_inputs or not fit.model.linear:
         return ""
     responses, of_map = Responses(fit), fit.affine is not None
-    if of_map and fit.unidentified is None:
-        if _sureness(fit, responses.spread)[0] >= _SURE:
-            return ""
+    plain = of_map and fit.unidentified is None
+    if plain and _sureness(fit, responses.spread)[0] >= _SURE:
+        return ""
     require = responses.require_sure if of_map else responses.require_regular
     refusal = ""
     for command in fit.commands.mean(axis=0)[None] if of_map else fit.commands:
@@ -237,9 +237,8 @@ class _Search(Responses):
         self.goal = fit.model.fitting.targets(wanted, start)
         measured_at = fit.commands
         points, count = np.arange(len(wanted)), len(measured_at)
-        there = self.goal(
-            np.tile(measured_at, (len(wanted), 1)), np.repeat(points, count)
-        )
+        tiled = np.tile(measured_at, (len(wanted), 1))
+        there = self.goal(tiled, np.repeat(points, count))
         outputs = predict(self.model, measured_at, fit.estimate)
         there = there.reshape(len(wanted), count, -1) - outputs
         there = self.model.fitting.wrapped(there, measured_at)

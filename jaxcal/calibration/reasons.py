@@ -101,13 +101,13 @@ def _stands_still(fit: Fit) -> Reason | None:
     still = (np.abs(readings - readings[0]) <= 1e-14 * size).all(axis=0)
     if len(readings) < 3 or not still.any():
         return None
-    slopes = fit.model.jacobian(fit.commands, fit.parameters)[:, still]
-    moves = np.ptp(slopes, axis=0).any(axis=-1)  # not by a constant alone
-    if not moves.any():
+    slopes = fit.model.jacobian(fit.commands, fit.parameters)
+    still &= np.ptp(slopes, axis=0).any(axis=-1)  # not by a constant alone
+    if not still.any():
         return None
     return Reason(
-        f"{', '.join(np.array(fit.output_names)[still][moves])}: the reading never "
-        f"changes: {each(readings[0, still][moves])} in all {len(readings)} rows.",
+        f"{', '.join(np.array(fit.output_names)[still])}: the reading never "
+        f"changes: {each(readings[0, still])} in all {len(readings)} rows.",
         "check that the sensor is connected, recorded and mounted on the moving part",
     )
 
