@@ -273,7 +273,7 @@ class SerialChain(Arm, Model):
         """This arm with stiff joints and round gears, as files have them."""
         if not self.compliance and not self.harmonics:
             return self
-        stiff = {"compliance": (), "yields": np.zeros(0)}
+        stiff: dict[str, Any] = {"compliance": (), "yields": np.zeros(0)}
         return dataclasses.replace(self, **stiff, harmonics=(), waves=np.zeros((0, 4)))
 
     def together(

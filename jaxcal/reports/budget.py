@@ -306,7 +306,7 @@ def _squares(calibration: Fit, source: Source, results: _Results, gain: Any) -> 
     """(R,) variances of the results by one source."""
     m, measured = calibration.num_outputs, calibration.measured
     moved = np.zeros(len(results.slopes))
-    shapes = {"offset": (np.ones_like(measured), 1.0)}
+    shapes: dict[str, Any] = {"offset": (np.ones_like(measured), 1.0)}
     shapes["scale"] = measured, results.readings
     for name, (shape, scaled) in shapes.items():
         size = one_or_each(f"{name} of {source.name}", getattr(source, name), m)

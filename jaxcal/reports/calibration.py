@@ -163,8 +163,9 @@ def _numbers(calibration: Calibration, check: Check | None) -> dict[str, Any]:
         numbers[name] = float(np.sqrt(np.mean(off[:, quantity.columns] ** 2)))
     errors = {"held_out_mean": held_out, "nominal_mean": nominal_errors(calibration)}
     for kind, of_rows in errors.items():
-        for name, quantity in named(calibration, kind) if of_rows is not None else ():
-            numbers[name] = float(quantity.size(of_rows).mean())
+        for name, quantity in named(calibration, kind):
+            if of_rows is not None:
+                numbers[name] = float(quantity.size(of_rows).mean())
     if check is not None:
         numbers["check_says"] = check.says
         numbers |= {"check_p": check.p_value, "check_power": check.power}

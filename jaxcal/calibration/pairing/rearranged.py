@@ -331,8 +331,8 @@ def polished(fit: Fitted) -> tuple[Fitted, dict[int, list[int]]]:
             path[i] = (low + best, path[i][1])
         if tuple(path) == fit.hypothesis.starts:
             break
-        changed = {"match": path_match(count, path), "starts": tuple(path)}
-        hypothesis = dataclasses.replace(fit.hypothesis, **changed)
+        match, old = path_match(count, path), fit.hypothesis
+        hypothesis = dataclasses.replace(old, match=match, starts=tuple(path))
         fit = fitted(table, hypothesis, fit.theta)
         noise = np.maximum(fit.noise, 1e-7)
     return fit, near
