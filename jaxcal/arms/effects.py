@@ -19,7 +19,7 @@ from jaxcal.arms.chain import SerialChain as Chain
 from jaxcal.arms.chain import turning
 from jaxcal.calibration.fit_model import fitted_again
 from jaxcal.calibration.verdict import left_out
-from jaxcal.checks import Array, numbers
+from jaxcal.checks import Array, one_or_each, require_none
 from jaxcal.models.model import ErrorGroups, Model
 from jaxcal.models.uncertainty import Noise, Prior
 
@@ -239,9 +239,8 @@ def noise_with_play(arm: Chain, play: ArrayLike) -> Noise:
             number or (J,); about 0.3 for hobby servos. A joint is off by it over
             the square root of 12.
     """
-    width = np.broadcast_to(numbers("play", play), (arm.num_joints,))
-    if not (width >= 0.0).all():
-        raise ValueError(f"play must not be negative, got {width.min():g}")
+    width = one_or_each("play", play, arm.num_joints)
+    require_none(~(width >= 0.0), width, "play must not be negative")
     by_inputs = np.zeros(len(arm.sensor.inputs))
     spread = np.concatenate([width / np.sqrt(12.0), by_inputs])
     return dataclasses.replace(arm.default_noise(), command_std=spread)

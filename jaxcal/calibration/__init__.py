@@ -11,9 +11,9 @@ import importlib
 from typing import Any
 
 from jaxcal.calibration.calibration import Calibration
+from jaxcal.calibration.fit import CalibrationWarning
 from jaxcal.calibration.identify import identify
 from jaxcal.calibration.verdict import Verdict
-from jaxcal.calibration.warning import CalibrationWarning
 
 __all__ = [
     "Budget",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
@@ -12,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.calibration.reasons import COARSE, resolution
-from jaxcal.calibration.warning import warn
 from jaxcal.checks import Array, Mask, array_of, numbers
 from jaxcal.information.singular import depends
 from jaxcal.models.identifiability import Identifiability, identifiability
@@ -24,6 +24,27 @@ from jaxcal.tables import COMMANDS, MEASURED, of_frame
 _FEW = 2000  # rows, among which one may hide
 _CHANCE = 0.0002  # of a table, that a reading lies so far above the others' fit
 FAR = 0.25  # of the range of what was measured, beyond it
+
+
+class CalibrationWarning(UserWarning):
+    """A calibration is not good, and why; or it is used far from its measurements.
+
+    Python shows the first of each kind for a line of a program, whatever it says, and
+    none after ``warnings.simplefilter("ignore", jaxcal.CalibrationWarning)``.
+    """
+
+    kind = ""
+
+    def __str__(self) -> str:
+        # Python shows a text once for each line: at its first look it is the kind.
+        return vars(self).pop("kind", "") or super().__str__()
+
+
+def warn(text: str, kind: str, stacklevel: int) -> None:
+    """Issue a CalibrationWarning of a kind, for which texts of calls differ."""
+    warning = CalibrationWarning(text)
+    warning.kind = kind
+    warnings.warn(warning, stacklevel=stacklevel + 1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

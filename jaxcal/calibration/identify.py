@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.calibration.calibration import Calibration
-from jaxcal.calibration.fit import outputs_at, stated_prior
+from jaxcal.calibration.fit import outputs_at, stated_prior, warn
 from jaxcal.calibration.fit_model import fit_model, fitted_again, require_fitting
 from jaxcal.calibration.pairing import of_unfitted
-from jaxcal.calibration.warning import warn
 from jaxcal.checks import (
     Array,
     array_of,

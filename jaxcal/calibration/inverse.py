@@ -11,8 +11,8 @@ from jaxcal.calibration.fit import (
     linearised,
     say_far,
     unseen_directions,
+    warn,
 )
-from jaxcal.calibration.warning import warn
 from jaxcal.checks import Array, Mask, array_of, in_words
 from jaxcal.information.singular import (
     depends,

@@ -285,9 +285,8 @@ class Board(Sensor):
         rows = np.zeros((len(pixels), 2, len(flat), 9))  # of u, then of v
         rows[:, 0, :, :3] = rows[:, 1, :, 3:6] = one
         rows[..., 6:] = -rays.transpose(0, 2, 1)[..., None] * one
-        plane = np.linalg.svd(rows.reshape(len(pixels), -1, 9))[2][:, -1].reshape(
-            -1, 3, 3
-        )
+        right = np.linalg.svd(rows.reshape(len(pixels), -1, 9))[2]
+        plane = right[:, -1].reshape(-1, 3, 3)
         plane = plane * np.sign(plane[:, 2:, 2:])  # the board is before the camera
         x, y = plane[..., 0] / size, plane[..., 1] / size
         scale = np.sqrt(np.linalg.norm(x, axis=1) * np.linalg.norm(y, axis=1))

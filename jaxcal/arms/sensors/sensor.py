@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from jaxcal.checks import Array, Indices, Mask, numbers
+from jaxcal.checks import Array, Indices, Mask, levels
 from jaxcal.models.model import Quantity, Rows, within_half
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -258,14 +258,7 @@ class Sensor(abc.ABC):
     def stds(self, length: float) -> Array:
         """(q,) standard deviations of the readings."""
         noise = self.usual_noise(length) if self.noise is None else self.noise
-        std = numbers("noise of the sensor", noise)
-        q = len(self.outputs)
-        if std.shape not in ((), (q,)) or not (std > 0.0).all():
-            raise ValueError(
-                f"noise of the sensor must be one positive number or ({q},), "
-                f"got {noise!r}"
-            )
-        return np.broadcast_to(std, (q,)).copy()
+        return levels("noise of the sensor", noise, len(self.outputs))
 
     def to_dict(self) -> dict[str, Any]:
         """JSON with its kind."""

@@ -96,8 +96,7 @@ class _Systems:
             costs,
             paired.astype(np.float64),
         )
-        axis = match.ndim - 1
-        total = []
+        axis, total = match.ndim - 1, []
         for part in parts:
             begin = np.zeros_like(np.take(part, [0], axis=axis))
             upto = np.concatenate([begin, np.cumsum(part, axis=axis)], axis=axis)
@@ -123,9 +122,8 @@ class _Systems:
     def evidence(self, sums: _Sums, extra: int = 0) -> Array:
         """(...) of least squares, no outlier left out."""
         known = self.table.ridge(sums.squares.shape[-1])
-        square = sums.totals - (
-            sums.products * solved(sums.squares, sums.products, known)
-        ).sum(axis=-2)
+        steps = solved(sums.squares, sums.products, known)
+        square = sums.totals - (sums.products * steps).sum(axis=-2)
         square = np.maximum(square, 0.0)
         return log_evidence(self.table, square, sums.counts, extra) - sums.costs
 
@@ -232,9 +230,8 @@ def _blocks(
     near = np.argsort(-scores)[:60]
     for index, by in enumerate(_SHIFTS[1:], 1):
         other = of_shift.at(index)
-        sums = around.at(near).plus(
-            other.at(second[near]).plus(other.at(first[near]), -1.0)
-        )
+        inside = other.at(second[near]).plus(other.at(first[near]), -1.0)
+        sums = around.at(near).plus(inside)
         scores_here = systems.evidence(sums) - code - np.log(6.0)
         best = int(scores_here.argmax())
         begin, end = int(edges[first[near[best]]]), int(edges[second[near[best]]])

@@ -77,13 +77,10 @@ def _hidden_outliers(fit: Fit) -> Reason | None:
     table = of_fit(fit)
     if table is None or table.precision[table.free].any():
         return None
-    several = range(table.outputs if table.shared and table.outputs > 1 else 0)
-    tables = [
-        (table, [*range(table.outputs)]),
-        *((alone(table, j), [j]) for j in several),
-    ]
-    reasons = (_outliers_of(fit, part, outputs) for part, outputs in tables)
-    return next((reason for reason in reasons if reason is not None), None)
+    outputs = [*range(table.outputs)]
+    several = outputs if table.shared and len(outputs) > 1 else []
+    tables = [(table, outputs), *((alone(table, j), [j]) for j in several)]
+    return next(filter(None, (_outliers_of(fit, *part) for part in tables)), None)
 
 
 def _outliers_of(fit: Fit, table: Table, outputs: list[int]) -> Reason | None:
