@@ -159,8 +159,8 @@ class Chains(Model):
     def _named(self) -> list[list[str]]:
         """Names in this model of the parameters of each chain."""
         named = []
-        each = zip(self.tips, self.chains, self._shared, strict=True)
-        for k, (tip, arm, shared) in enumerate(each):
+        chains = zip(self.tips, self.chains, self._shared, strict=True)
+        for k, (tip, arm, shared) in enumerate(chains):
             links = [f"{name}{i}" for i in range(1, shared) for name in COLUMNS]
             of_joint = ("gear{}", "compliance{}", *(f"theta{{}} {w}" for w in WAVES))
             joints = [n.format(i) for i in range(1, shared + 1) for n in of_joint]

@@ -160,9 +160,9 @@ class Socket(Landmarks):
         apart = places[j] - places[i]
         far = np.linalg.norm(apart, axis=1)
         apart[far == 0.0] = np.eye(3)[0]
-        rows, each = np.zeros((len(far), self.count, 3)), np.arange(len(far))
-        rows[each, j] = apart / np.where(far > 0.0, far, 1.0)[:, None] / std[:, None]
-        rows[each, i] = -rows[each, j]
+        rows, pair = np.zeros((len(far), self.count, 3)), np.arange(len(far))
+        rows[pair, j] = apart / np.where(far > 0.0, far, 1.0)[:, None] / std[:, None]
+        rows[pair, i] = -rows[pair, j]
         return (distance - far) / std, rows.reshape(len(far), parameters.size)
 
 
