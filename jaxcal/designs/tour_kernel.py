@@ -36,14 +36,11 @@ def best_order(times, start):
 
 def _exact_order(times, start):
     k = len(start)
-    every = np.arange(k)
     tours = np.full((1 << k, k), np.inf)
-    least = 0.0
-    for depth in range(k):
-        least = _extend(tours, times, start, every, depth)
+    _fill(tours, times, start)
     order = np.empty(k, np.int64)
     mask = (1 << k) - 1
-    last = int(tours[mask].argmin())
+    last, least = int(tours[mask].argmin()), tours[mask].min()
     for place in range(k - 1, -1, -1):
         order[place] = last
         mask &= ~(1 << last)
@@ -51,41 +48,22 @@ def _exact_order(times, start):
     return order, least
 
 
-def _extend(tours, times, start, chosen, depth):
-    """Add posture ``chosen[depth]`` to the table of best open tours (Held and Karp).
-
+def _fill(tours, times, start):
+    """Fill the table of best open tours (2^K, K), infinite before (Held and Karp):
     ``tours[mask, last]`` is the least time over the postures in ``mask`` that ends in
-    ``last``, known below ``2^depth``. Returns that of the first ``depth + 1`` chosen.
-    """
+    ``last``."""
     one: cython.Py_ssize_t = 1
-    bit = one << depth
-    new = chosen[depth]
-    for last in range(depth + 1):
-        tours[bit, last] = INFINITY
-    tours[bit, depth] = start[new]
-    rest: cython.Py_ssize_t
-    for rest in range(1, bit):
-        mask = rest | bit
-        best: cython.double = INFINITY
-        for before in range(depth):
-            if rest >> before & 1:
-                best = min(best, tours[rest, before] + times[chosen[before], new])
-        tours[mask, depth] = best
-        for last in range(depth):
-            best = INFINITY
-            if rest >> last & 1:
-                end = chosen[last]
-                without = mask & ~(one << last)
-                for before in range(depth + 1):
-                    if without >> before & 1:
-                        best = min(
-                            best, tours[without, before] + times[chosen[before], end]
-                        )
+    mask: cython.Py_ssize_t
+    for mask in range(1, one << tours.shape[1]):
+        for last in range(tours.shape[1]):
+            rest = mask & ~(one << last)
+            if rest == mask:
+                continue
+            best: cython.double = INFINITY if rest else start[last]
+            for before in range(tours.shape[1]):
+                if rest >> before & 1:
+                    best = min(best, tours[rest, before] + times[before, last])
             tours[mask, last] = best
-    least: cython.double = INFINITY
-    for last in range(depth + 1):
-        least = min(least, tours[2 * bit - 1, last])
-    return least
 
 
 def _improve(times, start, order, seconds):

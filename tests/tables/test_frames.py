@@ -233,8 +233,8 @@ def test_rows_that_are_not_available_are_used_and_said(calibration):
 
 def test_single_precision_stays_what_it_is():
     frame = COMMANDS.astype(np.float32)
-    plain = jaxcal.Design(frame.to_numpy()).candidate_set.candidates
-    np.testing.assert_array_equal(jaxcal.Design(frame).candidate_set.candidates, plain)
+    plain = jaxcal.Design(frame.to_numpy()).candidates
+    np.testing.assert_array_equal(jaxcal.Design(frame).candidates, plain)
 
 
 def test_words_among_readings_are_refused():
