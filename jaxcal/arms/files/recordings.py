@@ -295,7 +295,6 @@ def rests(
     return means, np.array(spans).reshape(-1, 2)
 
 
-_STEP_DEG = 360.0 / 4095.0  # of Feetech's and Dynamixel's servos
 _KEYS = ("id", "drive_mode", "homing_offset", "range_min", "range_max")
 
 
@@ -304,15 +303,17 @@ class Servos:
     """Motors of an arm as LeRobot calibrates them (SO-100, SO-101, Koch, ...).
 
     A motor at ``position`` steps (its encoder less ``homing_offset``) is at ``(position
-    - (range_min + range_max) / 2) 360 / 4095`` degrees, or at -100 to 100
+    - (range_min + range_max) / 2) 360 / (resolution - 1)`` degrees, or at -100 to 100
     of its range, reversed where ``drive_mode`` is 1, as in LeRobot's ``MotorsBus``.
 
     Attributes:
         motors: by name, ``id``, ``drive_mode``, ``homing_offset``, ``range_min`` and
             ``range_max``, whole numbers.
+        resolution: steps in a turn, 4096 of Feetech's STS3215.
     """
 
     motors: Mapping[str, Mapping[str, int]]
+    resolution: int = 4096
 
     def __post_init__(self) -> None:
         if not self.motors:
@@ -331,13 +332,13 @@ class Servos:
                 )
 
     @classmethod
-    def load(cls, path: AnyPath) -> Self:
+    def load(cls, path: AnyPath, resolution: int = 4096) -> Self:
         """Read the file that ``lerobot-calibrate`` wrote."""
         try:
             content = json.loads(pathlib.Path(path).read_text(encoding="utf-8-sig"))
             if not isinstance(content, dict):
                 raise ValueError("it must hold motors by name")
-            return cls(content)
+            return cls(content, resolution)
         except ValueError as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from None
 
@@ -360,7 +361,7 @@ class Servos:
         half = [0.5 * (m["range_max"] - m["range_min"]) for m in spans]
         sign = [-1.0 if m["drive_mode"] else 1.0 for m in spans]
         steps = values / 100.0 * np.array(half) * np.array(sign)
-        return np.asarray(steps * _STEP_DEG)
+        return np.asarray(steps * 360.0 / (self.resolution - 1))
 
     def middle(self, name: str) -> float:
         """Position of a motor's zero, in steps."""
@@ -377,7 +378,7 @@ class Servos:
         for name, degrees in by.items():
             motor = self._motor(name)
             low, high = motor["range_min"], motor["range_max"]
-            ends = low + high - round(2.0 * degrees / _STEP_DEG)
+            ends = low + high - round(2.0 * degrees * (self.resolution - 1) / 360.0)
             least, most = max(low, ends - high), min(high, ends - low)
             if most - least < 0.5 * (high - low):
                 raise ValueError(
