@@ -39,7 +39,8 @@ class AffineFitting(Fitting):
         """(p, p): the outputs at the centre stand for b."""
         m, n = self.model.num_outputs, self.model.num_inputs
         to_centred = np.eye(m * (n + 1))
-        to_centred[m * n :, : m * n] = np.kron(np.eye(m), centre)
+        for i in range(m):
+            to_centred[m * n + i, i * n : (i + 1) * n] = centre
         return to_centred
 
     def units_for(self, command_unit: str, measured_unit: str) -> tuple[str, ...]:

@@ -197,6 +197,10 @@ class Noise:
         eaten[:, : size.shape[-1]] = significant(size)
         return np.where(eaten[..., None], 0.0, np.matrix_transpose(basis) @ white)
 
+    def reading_std(self, count: int, num_outputs: int) -> Array:
+        """(N, q) ``std`` of the readings, 1 where it is not given."""
+        return np.ones((count, num_outputs)) * self._std(count, num_outputs)[..., 0]
+
     def require_shape(self, count: int, num_outputs: int) -> None:
         """Refuse what is not of N measurements of q readings."""
         if self.covariance is None:
@@ -275,7 +279,7 @@ def reading_noise(
     level, from 0."""
     count, levels = len(weights), np.arange(q)
     if noise.covariance is None:
-        std = np.ones((count, q)) * noise._std(count, q)[..., 0]
+        std = noise.reading_std(count, q)
         white = 1.0 / std
     else:
         white = Noise(covariance=noise.covariance).whitening(count, q)

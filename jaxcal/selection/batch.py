@@ -31,6 +31,7 @@ class BatchSelection:
     log_det: NDArray[np.float64]  # (B,) natural log det S
     proven: NDArray[np.bool_]  # (B,)
     bound: NDArray[np.float64]  # (B,) upper bound on log det S, inf where none is known
+    nodes: Indices  # (B,) nodes examined, 0 where not counted
     method: str
     seconds: float  # wall time of the whole batch
 
@@ -112,5 +113,5 @@ def _solved(
         )
     proven = np.array([one.proven for one in solutions])
     bounds = np.array([np.inf if x.bound is None else x.bound for x in solutions])
-    spent = time.perf_counter() - start
-    return BatchSelection(indices, values, proven, bounds, method, spent)
+    nodes, spent = np.array([x.nodes or 0 for x in solutions]), time.perf_counter()
+    return BatchSelection(indices, values, proven, bounds, nodes, method, spent - start)
