@@ -136,8 +136,9 @@ def identify(
         provenance["accuracy"] = by_unit("accuracy", accuracy, judged)
     plain = prior is None and plain_noise and loss in (None, "gaussian")
     affine = isinstance(model, Affine)
-    if loss is None and prior is None and model.affine(model.nominal) is not None:
-        loss = "gaussian"
+    if loss is None and prior is None:
+        if affine or model.affine(model.nominal) is not None:
+            loss = "gaussian"
     try:
         fields = fit_model(
             u,

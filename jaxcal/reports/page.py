@@ -54,6 +54,14 @@ class Table:
     caption: Content = ""
     numeric: bool = True  # all columns but the first are aligned to the right
 
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.head):
+                raise ValueError(
+                    f"a row must have {len(self.head)} cells as the header has, got "
+                    f"{len(row)}: {row!r}"
+                )
+
 
 @dataclasses.dataclass(frozen=True)
 class Figure:

@@ -200,8 +200,9 @@ def of_fit(fit: Fit) -> Table | None:
     if fit.noise_std is not None:  # what a display rounded, it read within a step
         step = resolution(measured, COARSE)
         step[fit.noise_std >= step] = 0.0
-        within = np.random.default_rng(0).uniform(-0.5, 0.5, measured.shape)
-        measured += step * within
+        if step.any():
+            within = np.random.default_rng(0).uniform(-0.5, 0.5, measured.shape)
+            measured += step * within
     counted = fit.loss_weights > 0.0
     table = _table(fit.model, fit.commands, measured, prior, counted)
     return table and dataclasses.replace(table, theta=np.asarray(fit.parameters))
