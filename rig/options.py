@@ -6,11 +6,10 @@ import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rig.parts import part
+from rig.parts import SimulatedDevice, part
 
 if TYPE_CHECKING:
     from rig.config import RigConfig
-    from rig_workbench.simulator import Simulator
 
 
 def _axes(text: str) -> list[str]:
@@ -83,10 +82,10 @@ class DeviceOptions(Simulation):
 
     def simulator(
         self, config: RigConfig, options: dict[str, Any] | None = None
-    ) -> Simulator:
+    ) -> SimulatedDevice:
         """A simulated rig as these options, or those of a run, describe it."""
         options, simulator = options or self.simulation, part("simulator", "--simulate")
-        made: Simulator = simulator.simulated(config, options, self.fault or ())
+        made: SimulatedDevice = simulator.simulated(config, options, self.fault or ())
         return made
 
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.calibration.reasons import COARSE, resolution
+from jaxcal.calibration.resolution import COARSE, resolution
 from jaxcal.checks import Array, Mask, array_of, numbers
 from jaxcal.information.singular import depends
 from jaxcal.models.identifiability import Identifiability, identifiability

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jaxcal.calibration.resolution import resolution
 from jaxcal.checks import Array, Mask
 
 if TYPE_CHECKING:
     from jaxcal.calibration.fit import Fit
 
-COARSE = 50.0  # steps that readings must span to show one
-_FINEST, _ROUNDED = 1e-6, 1e-9  # of the largest reading: a sensor's step; its rounding
 _FROZEN = 3  # readings after the first that repeat it
 _STEPS = 20.0  # of a sensor between readings: with fewer, some repeat by chance
 _EXACT = 1e-12  # of the largest reading: rounding, and no noise of a sensor
@@ -47,22 +45,6 @@ def in_rows(rows: Sequence[int]) -> str:
     named = ", ".join(map(str, rows[:_NAMED]))
     more = f" and {len(rows) - _NAMED} more" if len(rows) > _NAMED else ""
     return f"row{'s' * (len(rows) > 1)} {named}{more}"
-
-
-def resolution(readings: Array, least: float = 0.0) -> Array:
-    """(m,) of which differences of readings (N, m) are multiples, by Euclid; 0 where
-    these have more digits than a sensor shows, or lie fewer than ``least`` apart."""
-    size = np.abs(readings).max(axis=0)
-    steps = np.zeros(readings.shape[1])
-    for j in size.nonzero()[0]:
-        for gap in (np.diff(np.unique(readings[:, j])) / size[j]).tolist():
-            while gap > _ROUNDED:
-                steps[j], gap = gap, abs(math.remainder(steps[j], gap))
-            if steps[j] < _FINEST:
-                steps[j] = 0.0
-                break
-    steps *= size
-    return np.where(np.ptp(readings, axis=0) < least * steps, 0.0, steps)
 
 
 # -- readings that were not measured ---------------------------------------------------

@@ -33,7 +33,7 @@ from rig.readings.source import Source
 from rig_workbench.model import joint_names
 
 if TYPE_CHECKING:
-    from rig_workbench.simulator import Simulator
+    from rig.parts import SimulatedDevice
 
 FORMATS = ["hyperimu", "sensorlogger", "sensorlog", "json", "lines"]
 SAFETY = (
@@ -127,7 +127,7 @@ def setting(text: str) -> tuple[str, Any]:
         return key, value
 
 
-def simulated(simulator: Simulator, options: SetupOptions) -> SetupOptions:
+def simulated(simulator: SimulatedDevice, options: SetupOptions) -> SetupOptions:
     """What an operator would answer of a simulated device, and its phone started."""
     bus = simulator.start().bus
     where = f"{bus.transport}:{bus.host}:{bus.port}"

@@ -144,3 +144,4 @@ def test_a_sensor_that_waits_for_a_request_is_asked_for_each_line():
                         pass
                     connection.sendall(b"%g,3\r\n" % value)
                     read(source, [value, 3.0])
+        assert source.counts == {"accepted": 2}

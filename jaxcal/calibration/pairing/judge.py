@@ -31,7 +31,8 @@ from jaxcal.calibration.pairing.fit import (
     path_match,
     top,
 )
-from jaxcal.calibration.reasons import COARSE, froze, in_rows, resolution
+from jaxcal.calibration.reasons import froze, in_rows
+from jaxcal.calibration.resolution import COARSE, resolution
 from jaxcal.checks import Array, in_words
 from jaxcal.models.model import Model, Rows
 from jaxcal.models.uncertainty import Prior

@@ -24,7 +24,8 @@ from jaxcal.calibration.pairing.judge import (
     better,
     of_fit,
 )
-from jaxcal.calibration.reasons import COARSE, Reason, in_rows, resolution
+from jaxcal.calibration.reasons import Reason, in_rows
+from jaxcal.calibration.resolution import COARSE, resolution
 from jaxcal.calibration.verdict import Verdict, bends
 from jaxcal.checks import in_words
 
